@@ -1,0 +1,85 @@
+"""A recording kept as files, one depth image, one colour image and one pose a frame: what most formats come down to.
+
+The modules beside this one list the files of their format and hand them over; loading is the same for all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from numbers import Real
+from pathlib import Path
+
+from ..errors import DatasetError, FrameError, InputError
+from ..types import Frame, PinholeCamera
+from .base import Dataset
+from .checks import camera_warnings, pose_warnings
+from .images import INVALID_DEPTH, depth_file_size, read_color, read_depth, resize_color
+from .poses import Pose
+
+SIZE_SAMPLES = 5  # depth headers read to learn the size, so that one odd file does not decide it
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """Where the parts of one frame are expected; None: the recording has no such part at all."""
+
+    depth: Path
+    color: Path | None = None
+    pose: Pose | None = None
+    timestamp: float | None = None  # [s]
+
+
+class Recording(Dataset):
+    """Frames read from files when asked for.
+
+    `depth_scale` is in units a metre, `invalid` the units that mean no reading, `fit_color` resamples colour of another size.
+    """
+
+    def __init__(self, name: str, frames: Sequence[FrameFiles], camera: PinholeCamera, depth_scale: float, *,
+                 invalid: Collection[int] = INVALID_DEPTH, fit_color: bool = False, drop_alpha: bool = False,
+                 warnings: Iterable[str] = ()) -> None:
+        self.name, self.frames, self.camera = name, tuple(frames), camera
+        self.depth_scale = check_depth_scale(depth_scale, name)
+        self.invalid, self.fit_color, self.drop_alpha = tuple(invalid), fit_color, drop_alpha
+        poses = [frame.pose for frame in self.frames if frame.pose is not None]
+        self.warnings = (*warnings, *camera_warnings(camera), *pose_warnings(poses))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def load(self, index: int) -> Frame:
+        """Read frame `index`; FrameError (PoseError, SizeMismatch) names the file that is at fault."""
+        files = self.frames[index]
+        T_world_camera = files.pose.checked() if files.pose else None
+        depth = read_depth(files.depth, self.depth_scale, self.invalid)
+        color = None
+        if files.color is not None:
+            color = read_color(files.color, drop_alpha=self.drop_alpha)
+            if self.fit_color:
+                color = resize_color(color, depth.shape[1], depth.shape[0], str(files.color))
+        return Frame(depth, self.camera, color, T_world_camera, index, files.timestamp, str(files.depth))
+
+
+def check_depth_scale(depth_scale: float, source: str) -> float:
+    """The scale in units a metre, or InputError if it is no positive number."""
+    if not (isinstance(depth_scale, Real) and math.isfinite(depth_scale) and depth_scale > 0):
+        raise InputError(f"{source}: depth_scale must be a positive number of units a metre, got {depth_scale}")
+    return float(depth_scale)
+
+
+def depth_size(frames: Sequence[FrameFiles]) -> tuple[int, int]:
+    """(width, height) that most of a few depth images have, from their headers; DatasetError if none can be read."""
+    sizes, problem = Counter(), None
+    for frame in frames:
+        try:
+            sizes[depth_file_size(frame.depth)] += 1
+        except FrameError as error:
+            problem = problem or error
+        if sizes.total() == SIZE_SAMPLES:
+            break
+    if not sizes:
+        raise DatasetError(f"none of {len(frames)} depth images can be read (first: {problem})")
+    return sizes.most_common(1)[0][0]

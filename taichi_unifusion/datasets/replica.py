@@ -1,0 +1,75 @@
+"""Replica as rendered for iMAP and NICE-SLAM: `results/frameXXXXXX.jpg`, `results/depthXXXXXX.png`, `traj.txt`.
+
+The images may also lie beside traj.txt. Depth: 16 bits, 6553.5 units a metre; 65535 is 10 m or more and taken as no reading.
+Poses: row i of traj.txt, 16 numbers, is the 4x4 camera-to-world matrix of frame *number* i in metres, camera x right, y down,
+z forward. Intrinsics and depth scale: `cam_params.json` beside traj.txt or one folder up, else 1200x680, fx = fy = 600,
+cx 599.5, cy 339.5.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..errors import DatasetError
+from ..types import PinholeCamera
+from .intrinsics import check_size, make_camera
+from .listing import file_of, first_existing, numbered_files
+from .poses import Pose, read_matrix_rows
+from .recording import FrameFiles, Recording, check_depth_scale, depth_size
+
+DEPTH_SCALE = 6553.5
+DEFAULT_CAMERA = PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)
+
+
+def open_replica(path: Path, *, depth_scale: float | None = None, camera: PinholeCamera | None = None,
+                 drop_alpha: bool = False) -> Recording:
+    """The scene in folder `path`, which holds traj.txt (or is the results folder beside it)."""
+    trajectory = first_existing([path / "traj.txt"] + [path.parent / "traj.txt"] * (path.name == "results"))
+    images = path / "results" if (path / "results").is_dir() else path
+    color = numbered_files(images, r"frame(\d+)\.(?:jpg|jpeg|png)")
+    depth = numbered_files(images, r"depth(\d+)\.png")
+    if not color and not depth:
+        raise DatasetError(f"{images}: no frameXXXXXX.jpg or depthXXXXXX.png here")
+    if trajectory is None:
+        raise DatasetError(f"{path}: no traj.txt here; it holds the poses, one 4x4 matrix a row")
+    rows = read_matrix_rows(trajectory)
+    frames = [FrameFiles(file_of(number, depth, images, "depth{:06d}.png"), file_of(number, color, images, "frame{:06d}.jpg"),
+                         _pose_of(number, rows, trajectory))
+              for number in sorted({*color, *depth})]
+    read_camera, read_scale = _read_parameters(trajectory.parent)
+    source = "camera" if camera is not None else f"{path}: Replica's usual camera or cam_params.json"
+    camera = check_size(camera or read_camera, depth_size(frames), source)
+    return Recording(f"replica {path}", frames, camera, read_scale if depth_scale is None else depth_scale,
+                     drop_alpha=drop_alpha, warnings=_extra_rows(rows, max({*color, *depth}), trajectory))
+
+
+def _pose_of(number: int, rows: Sequence[Pose], trajectory: Path) -> Pose:
+    if number < len(rows):
+        return rows[number]
+    return Pose(str(trajectory), problem=f"holds {len(rows)} rows, none for frame number {number} (the first is number 0)")
+
+
+def _extra_rows(rows: Sequence[Pose], last_number: int, trajectory: Path) -> list[str]:
+    if len(rows) <= last_number + 1:
+        return []
+    return [f"{trajectory}: holds {len(rows)} poses but the last frame is number {last_number}; row i is taken for number i"]
+
+
+def _read_parameters(folder: Path) -> tuple[PinholeCamera, float]:
+    """Camera and depth scale from cam_params.json, or Replica's usual ones where there is none."""
+    file = first_existing((folder / "cam_params.json", folder.parent / "cam_params.json"))
+    if file is None:
+        return DEFAULT_CAMERA, DEPTH_SCALE
+    try:
+        values = json.loads(file.read_text(encoding="utf-8-sig"))
+        values = values.get("camera", values)
+        w, h, fx, fy, cx, cy = (float(values[key]) for key in ("w", "h", "fx", "fy", "cx", "cy"))
+        scale = float(values.get("scale", DEPTH_SCALE))
+        size = int(w), int(h)
+    except KeyError as error:
+        raise DatasetError(f"{file}: no {error} in it; expected w, h, fx, fy, cx, cy (and scale)") from None
+    except (OSError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        raise DatasetError(f"{file}: not the camera of a Replica recording ({error})") from error
+    return make_camera(str(file), size, fx, fy, cx, cy), check_depth_scale(scale, str(file))

@@ -1,0 +1,1 @@
+"""Taichi kernels: plain functions, no state; a kernel writes only what its signature shows under `# out:`."""

@@ -1,0 +1,185 @@
+"""Preprocessing on the image grid, and rigid motion.
+
+Every input is real somewhere: readings are tested by their bits, because the compiler may assume that there is no NaN.
+"""
+
+import taichi as ti
+
+from .voxels import Floats2, Floats3, Ints1, Ints2, row3
+
+Bytes3 = ti.types.ndarray(dtype=ti.u8, ndim=3)
+PIXEL_CHUNK = 64  # pixels that one thread compacts
+
+
+@ti.kernel
+def clip_depth(
+    # in:
+    depth: Floats2,    # (H, W) [m], anything
+    depth_min: ti.f32, depth_max: ti.f32,
+    # out:
+    clipped: Floats2,  # (H, W) [m], 0 where there is no reading in range
+):
+    low, high = ti.bit_cast(depth_min, ti.i32), ti.bit_cast(depth_max, ti.i32)
+    for v, u in depth:
+        bits = ti.bit_cast(depth[v, u], ti.i32)  # ordered as positive floats are; NaN and inf lie above, negatives below
+        clipped[v, u] = depth[v, u] if bits >= low and bits <= high else 0.0
+
+
+@ti.kernel
+def drop_flying_pixels(
+    # in:
+    depth: Floats2,    # (H, W) [m], 0: none
+    jump: ti.f32,      # pixels whose depths differ by less than this share belong together
+    support: ti.i32,   # of its 8 neighbours, so many must belong together with a pixel
+    # out:
+    cleaned: Floats2,  # (H, W) [m], 0 also where a pixel hangs between surfaces
+):
+    height, width = depth.shape[0], depth.shape[1]
+    for v, u in depth:
+        z = depth[v, u]
+        close = 0
+        if z > 0 and v > 0 and u > 0 and v < height - 1 and u < width - 1:
+            for dv, du in ti.static(ti.ndrange((-1, 2), (-1, 2))):
+                if ti.static(dv != 0 or du != 0):
+                    close += ti.cast(ti.abs(depth[v + dv, u + du] - z) <= jump * z, ti.i32)
+        cleaned[v, u] = z if close >= support else 0.0
+
+
+@ti.func
+def inverse_depth_slope(depth: ti.template(), v: ti.i32, u: ti.i32, radius: ti.i32, jump: ti.f32):
+    """Least-squares slopes of 1/z by u and v over a window, from pairs of pixels opposite to (v, u) that belong with it.
+
+    A plane has an inverse depth that is linear in the image. Also returns the fewer of the two counts of pairs.
+    """
+    z = depth[v, u]
+    near, far = 1.0 / (z * (1.0 + jump)), 1.0 / (z * (1.0 - jump))
+    along_u, along_v, square_u, square_v = 0.0, 0.0, 0.0, 0.0
+    height, width = depth.shape[0], depth.shape[1]
+    if v >= radius and u >= radius and v < height - radius and u < width - radius:
+        for i in range(-radius, radius + 1):
+            for k in range(1, radius + 1):
+                right, left = depth[v + i, u + k], depth[v + i, u - k]
+                below, above = depth[v + k, u + i], depth[v - k, u + i]
+                right, left, below, above = 1 / right, 1 / left, 1 / below, 1 / above  # 1/0 is far above `far`
+                if right > near and right < far and left > near and left < far:
+                    along_u += k * (right - left)
+                    square_u += 2 * k * k
+                if below > near and below < far and above > near and above < far:
+                    along_v += k * (below - above)
+                    square_v += 2 * k * k
+    return along_u / ti.max(square_u, 1.0), along_v / ti.max(square_v, 1.0), ti.min(square_u, square_v)
+
+
+@ti.kernel
+def estimate_normals(
+    # in:
+    depth: Floats2,     # (H, W) [m], 0: none
+    fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32,
+    radius: ti.i32,     # of the window [pixels]
+    jump: ti.f32,
+    cos_max_angle: ti.f32,  # between the normal and the ray back to the camera
+    # out:
+    normals: Floats3,   # (H, W, 3) unit, towards the camera; z component 0 where there is none
+):
+    height, width = depth.shape[0], depth.shape[1]
+    for v2, u2 in ti.ndrange((height + 1) // 2, (width + 1) // 2):
+        slope_u, slope_v, found, of = 0.0, 0.0, 0.0, 0.0
+        for part in range(4):  # a quad of pixels shares its slopes where it lies on one surface
+            v, u = v2 * 2 + part // 2, u2 * 2 + part % 2
+            if v < height and u < width:
+                z = depth[v, u]
+                n = ti.Vector([0.0, 0.0, 0.0])
+                if z > 0:
+                    if found == 0.0 or ti.abs(z - of) > 0.5 * jump * z:
+                        slope_u, slope_v, found = inverse_depth_slope(depth, v, u, radius, jump)
+                        of = z
+                    if found >= 2 * radius * radius:
+                        ray = ti.Vector([(u - cx) / fx, (v - cy) / fy, 1.0])
+                        m = ti.Vector([slope_u * fx, slope_v * fy, 1 / z - slope_u * (u - cx) - slope_v * (v - cy)]) * z
+                        if 1.0 >= cos_max_angle * m.norm() * ray.norm():  # m . ray = 1
+                            n = -m.normalized()
+                for d in ti.static(range(3)):
+                    normals[v, u, d] = n[d]
+
+
+@ti.kernel
+def count_points(
+    # in:
+    depth: Floats2,    # (H, W)
+    normals: Floats3,  # (H, W, 3)
+    # out:
+    counts: Ints1,     # (H W / PIXEL_CHUNK,) pixels with a reading and a normal
+):
+    width, size = depth.shape[1], depth.shape[0] * depth.shape[1]
+    for chunk in range(counts.shape[0]):
+        count = 0
+        for p in range(chunk * PIXEL_CHUNK, ti.min((chunk + 1) * PIXEL_CHUNK, size)):
+            count += ti.cast(depth[p // width, p % width] > 0 and normals[p // width, p % width, 2] != 0, ti.i32)
+        counts[chunk] = count
+
+
+@ti.kernel
+def unproject(
+    # in:
+    depth: Floats2, normals: Floats3,
+    fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32,
+    starts: Ints1,        # (H W / PIXEL_CHUNK,) first point of each chunk
+    # out:
+    points: Floats2,      # (N, 3) camera [m]
+    point_normals: Floats2,  # (N, 3)
+    pixels: Ints2,        # (N, 2) row and column
+):
+    width, size = depth.shape[1], depth.shape[0] * depth.shape[1]
+    for chunk in range(starts.shape[0]):
+        n = starts[chunk]
+        for p in range(chunk * PIXEL_CHUNK, ti.min((chunk + 1) * PIXEL_CHUNK, size)):
+            v, u = p // width, p % width
+            z = depth[v, u]
+            if z > 0 and normals[v, u, 2] != 0:
+                points[n, 0], points[n, 1], points[n, 2] = (u - cx) / fx * z, (v - cy) / fy * z, z
+                for d in ti.static(range(3)):
+                    point_normals[n, d] = normals[v, u, d]
+                pixels[n, 0], pixels[n, 1] = v, u
+                n += 1
+
+
+@ti.kernel
+def sample_color(
+    # in:
+    pixels: Ints2,   # (N, 2)
+    color: Bytes3,   # (H, W, 3)
+    # out:
+    values: Floats2,  # (N, 3) in [0, 1]
+):
+    for n in range(pixels.shape[0]):
+        for c in ti.static(range(3)):
+            values[n, c] = ti.cast(color[pixels[n, 0], pixels[n, 1], c], ti.f32) * (1.0 / 255.0)
+
+
+@ti.kernel
+def sample_image(
+    # in:
+    pixels: Ints2,    # (N, 2)
+    image: Floats3,   # (H, W, c)
+    # out:
+    values: Floats2,  # (N, c)
+):
+    for n in range(pixels.shape[0]):
+        for c in range(values.shape[1]):
+            values[n, c] = image[pixels[n, 0], pixels[n, 1], c]
+
+
+@ti.kernel
+def transform(
+    # in:
+    points: Floats2,  # (N, 3) in a
+    matrix: Floats2,  # (3, 4) T_b_a without its last row
+    # out:
+    moved: Floats2,   # (N, 3) in b
+):
+    R = ti.Matrix([[matrix[i, j] for j in range(3)] for i in range(3)])
+    t = ti.Vector([matrix[i, 3] for i in range(3)])
+    for n in range(points.shape[0]):
+        x = R @ row3(points, n) + t
+        for d in ti.static(range(3)):
+            moved[n, d] = x[d]

@@ -1,0 +1,165 @@
+"""Marching cubes on sparse cubes of samples, with vertices shared across cube borders (Lorensen and Cline)."""
+
+import taichi as ti
+
+from .query import UNKNOWN
+from .voxels import CELLS, Floats2, Ints1, Ints2, Masks2, row3
+
+Cases2 = ti.types.ndarray(dtype=ti.u8, ndim=2)
+
+
+@ti.func
+def sample_at(q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.template()):
+    """Cube and sample number of lattice sample ijk of cube q, which may lie in a cube above; cube -1 where there is none."""
+    over = ti.cast(ijk >= resolution, ti.i32)
+    cube = upper[q, over[0] * 4 + over[1] * 2 + over[2]]
+    at = ijk - over * resolution
+    return cube, (at[0] * resolution + at[1]) * resolution + at[2]
+
+
+@ti.func
+def cell_case(q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.template(), sdf: ti.template()) -> ti.i32:
+    """Bit o set where corner o (x slowest) lies behind the surface; 0, no surface, where a corner is unknown."""
+    case, known = 0, True
+    for o in ti.static(range(8)):
+        cube, s = sample_at(q, ijk + ti.Vector([o // 4, o // 2 % 2, o % 2]), resolution, upper)
+        value = UNKNOWN
+        if cube >= 0:
+            value = sdf[cube, s]
+        if value >= 0.5 * UNKNOWN:
+            known = False
+        if value < 0:
+            case |= 1 << o
+    return case if known else 0
+
+
+@ti.func
+def is_supported(support: ti.template(), q: ti.i32, ijk: ti.template(), resolution: ti.i32) -> ti.i32:
+    """Whether the support cell that contains the middle of a mesh cell is set."""
+    cell = (2 * ijk + 1) * CELLS // (2 * resolution)
+    bit = (cell[0] * CELLS + cell[1]) * CELLS + cell[2]
+    return ti.cast((support[q, bit // 32] >> ti.cast(31 - bit % 32, ti.u32)) & ti.u32(1), ti.i32)
+
+
+@ti.kernel
+def classify_cells(
+    # in:
+    resolution: ti.i32,
+    upper: Ints2,          # (Q, 8) cube at step (o / 4, o / 2 % 2, o % 2), or -1
+    support: Masks2,       # (Q, 2)
+    sdf: Floats2,          # (Q, R^3)
+    triangle_counts: Ints1,  # (256,)
+    corner_edges: Ints2,   # (12, 4) lower corner (3) and axis of each cell edge
+    edge_flags: Ints1,     # (256,) bit e: the case has a vertex on edge e
+    # out:
+    cases: Cases2,         # (Q, R^3) case of each cell, 0 where empty or unsupported
+    edges: Ints2,         # (Q, R^3) bit d: a vertex lies on the edge from the sample along axis d
+    triangles: Ints1,      # (Q,) triangles
+):
+    for q in range(sdf.shape[0]):
+        total = 0
+        for c in range(sdf.shape[1]):
+            ijk = ti.Vector([c // (resolution * resolution), c // resolution % resolution, c % resolution])
+            case = 0
+            if is_supported(support, q, ijk, resolution) == 1:
+                case = cell_case(q, ijk, resolution, upper, sdf)
+            cases[q, c] = ti.cast(case, ti.u8)
+            total += triangle_counts[case]
+            if triangle_counts[case] > 0:
+                for e in range(12):
+                    if edge_flags[case] >> e & 1:
+                        cube, s = sample_at(q, ijk + row3(corner_edges, e), resolution, upper)
+                        ti.atomic_or(edges[cube, s], 1 << corner_edges[e, 3])
+        triangles[q] = total
+
+
+@ti.kernel
+def count_vertices(
+    # in:
+    edges: Ints2,    # (Q, R^3)
+    # out:
+    vertices: Ints1,  # (Q,)
+):
+    for q in range(edges.shape[0]):
+        total = 0
+        for s in range(edges.shape[1]):
+            for d in ti.static(range(3)):
+                total += edges[q, s] >> d & 1
+        vertices[q] = total
+
+
+@ti.kernel
+def place_vertices(
+    # in:
+    resolution: ti.i32,
+    keys: Ints2,       # (Q, 3) lattice corners, in voxels; a cube spans [key - 1/2, key + 1/2)
+    upper: Ints2,
+    sdf: Floats2,
+    edges: Ints2,
+    starts: Ints1,     # (Q,) first vertex of each cube
+    voxel_size: ti.f32,
+    # out:
+    first: Ints2,       # (Q, R^3) first vertex on the edges of a sample
+    vertices: Floats2,  # (V, 3) world [m]
+):
+    for q in range(sdf.shape[0]):
+        v = starts[q]
+        for s in range(sdf.shape[1]):
+            first[q, s] = v
+            ijk = ti.Vector([s // (resolution * resolution), s // resolution % resolution, s % resolution])
+            for d in ti.static(range(3)):
+                if edges[q, s] >> d & 1:
+                    cube, other = sample_at(q, ijk + ti.Vector.unit(3, d, ti.i32), resolution, upper)
+                    a, b = sdf[q, s], sdf[cube, other]
+                    x = (ti.cast(ijk, ti.f32) + ti.Vector.unit(3, d, ti.f32) * (a / (a - b))) / resolution - 0.5
+                    for k in ti.static(range(3)):
+                        vertices[v, k] = (keys[q, k] + x[k]) * voxel_size
+                    v += 1
+
+
+@ti.kernel
+def emit_triangles(
+    # in:
+    resolution: ti.i32,
+    upper: Ints2,
+    cases: Cases2,
+    edges: Ints2,
+    first: Ints2,
+    starts: Ints1,           # (Q,) first triangle of each cube
+    triangle_counts: Ints1,  # (256,)
+    triangle_edges: Ints2,   # (256, 15) cell edges, three a triangle
+    corner_edges: Ints2,     # (12, 4)
+    # out:
+    faces: Ints2,             # (F, 3)
+):
+    for q in range(cases.shape[0]):
+        f = starts[q]
+        for c in range(cases.shape[1]):
+            case = ti.cast(cases[q, c], ti.i32)
+            ijk = ti.Vector([c // (resolution * resolution), c // resolution % resolution, c % resolution])
+            for t in range(triangle_counts[case]):
+                for k in ti.static(range(3)):
+                    e = triangle_edges[case, 3 * t + k]
+                    cube, s = sample_at(q, ijk + row3(corner_edges, e), resolution, upper)
+                    vertex = first[cube, s]
+                    for d in range(corner_edges[e, 3]):  # vertices of a sample are numbered by axis
+                        vertex += edges[cube, s] >> d & 1
+                    faces[f, k] = vertex
+                f += 1
+
+
+@ti.kernel
+def sum_normals(
+    # in:
+    vertices: Floats2,  # (V, 3)
+    faces: Ints2,        # (F, 3)
+    per_area: ti.f32,   # scale of the cross products, so that sums fit the integers
+    # out:
+    normals: Ints2,      # (V, 3) += area-weighted face normals, fixed point: the same in any order
+):
+    for f in range(faces.shape[0]):
+        a, b, c = row3(vertices, faces[f, 0]), row3(vertices, faces[f, 1]), row3(vertices, faces[f, 2])
+        n = (b - a).cross(c - a) * per_area
+        for k in ti.static(range(3)):
+            for d in ti.static(range(3)):
+                ti.atomic_add(normals[faces[f, k], d], ti.cast(ti.round(n[d]), ti.i32))

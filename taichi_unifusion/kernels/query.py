@@ -1,0 +1,118 @@
+"""Decoding: f_dec(x, F) = f_posi(t) F at points and on the grid for marching cubes (Eq. 7, Sec. IV-B)."""
+
+import taichi as ti
+
+from .encoding import position_features
+from .voxels import CELLS, INDEX_HALF, Floats1, Floats2, Floats3, Ints2, Masks2, all_within, row3, voxel_of
+
+UNKNOWN = 1e9  # signed distance where no voxel reaches
+
+
+@ti.kernel
+def query_points(
+    # in:
+    rank: ti.template(), channels: ti.template(), centered: ti.template(),
+    blend: ti.template(),   # all doubled voxels that contain the point, with tent weights; else its own voxel only
+    points: Floats2,        # (N, 3) world [m]
+    per_meter: ti.f32,
+    slot: ti.template(),
+    latents: Floats3,       # (S, l [+ 1], c)
+    anchors: Floats2, projection: Floats2, scale: ti.f32,
+    # out:
+    values: Floats2,        # (N, c) 0 where not valid
+    valid: ti.types.ndarray(dtype=ti.u8, ndim=1),  # (N,)
+):
+    for n in range(points.shape[0]):
+        x = row3(points, n) * per_meter
+        total = ti.Vector([0.0] * channels)
+        weight = 0.0
+        if all_within(x, INDEX_HALF - 2.0):
+            corner = voxel_of(x - 0.5) if ti.static(blend) else voxel_of(x)
+            for o in range(8 if ti.static(blend) else 1):
+                ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
+                s = slot[ijk + INDEX_HALF] - 1
+                if s >= 0:
+                    t = (x - ijk - 0.5) * 0.5
+                    tent = 1.0
+                    if ti.static(blend):
+                        for d in ti.static(range(3)):
+                            tent *= ti.max(1.0 - 2.0 * ti.abs(t[d]), 1e-6)
+                    f = position_features(t, rank, anchors, projection, scale)
+                    for c in ti.static(range(channels)):
+                        value = latents[s, rank, c] if ti.static(centered) else 0.0
+                        for a in ti.static(range(rank)):
+                            value += f[a] * latents[s, a, c]
+                        total[c] += tent * value
+                    weight += tent
+        valid[n] = ti.cast(weight > 0, ti.u8)
+        for c in ti.static(range(channels)):
+            values[n, c] = total[c] / ti.max(weight, 1e-12)
+
+
+@ti.func
+def corner_slot(keys: ti.template(), q: ti.i32, o: ti.i32, slot: ti.template()) -> ti.i32:
+    """Slot of voxel o of the eight around lattice corner q, or -1."""
+    ijk = row3(keys, q) - ti.Vector([1 - o // 4, 1 - o // 2 % 2, 1 - o % 2])
+    return slot[ti.math.clamp(ijk, -INDEX_HALF, INDEX_HALF - 1) + INDEX_HALF] - 1
+
+
+@ti.kernel
+def corner_support(
+    # in:
+    keys: Ints2,           # (Q, 3) lattice corners; the cube of corner q spans the centres of its eight voxels
+    slot: ti.template(),
+    map_masks: Masks2,     # (S, 2) support of each voxel's cells
+    reach: ti.i32,         # cells, 0..2
+    # out:
+    support: Masks2,       # (Q, 2) cells of the cube within reach of a supported one, as `occupancy` numbers them
+):
+    for q in range(keys.shape[0]):
+        for half in ti.static(range(2)):
+            support[q, half] = ti.u32(0)
+        for o in range(8):
+            s = corner_slot(keys, q, o, slot)
+            if s >= 0:
+                # A voxel's cells 0..3 along an axis are cells -2..1 (upper voxel: 2..5) of the cube that starts at its centre.
+                base = ti.Vector([o // 4, o // 2 % 2, o % 2]) * CELLS - CELLS // 2
+                for half in range(2):
+                    mask = map_masks[s, half]
+                    while mask != 0:
+                        k = ti.math.clz(ti.cast(mask, ti.i32))
+                        mask ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
+                        cell = half * 32 + k
+                        at = base + ti.Vector([cell // (CELLS * CELLS), cell // CELLS % CELLS, cell % CELLS])
+                        for i in range(ti.max(at[0] - reach, 0), ti.min(at[0] + reach + 1, CELLS)):
+                            for j in range(ti.max(at[1] - reach, 0), ti.min(at[1] + reach + 1, CELLS)):
+                                for l in range(ti.max(at[2] - reach, 0), ti.min(at[2] + reach + 1, CELLS)):
+                                    bit = (i * CELLS + j) * CELLS + l
+                                    support[q, bit // 32] |= ti.u32(1) << ti.cast(31 - bit % 32, ti.u32)
+
+
+@ti.kernel
+def sdf_grid(
+    # in:
+    rank: ti.template(),
+    keys: Ints2,          # (Q, 3) lattice corners
+    slot: ti.template(),
+    latents: Floats3,     # (S, l, 1)
+    basis: Floats2,       # (R^3, 8 l) tent weight times f_posi of each voxel, at the R^3 samples of a cube
+    tents: Floats2,       # (R^3, 8)
+    # out:
+    sdf: Floats2,         # (Q, R^3) signed distance [voxels], UNKNOWN where no voxel reaches
+):
+    for q in range(keys.shape[0]):
+        F = ti.Vector([0.0] * (8 * rank))
+        present = ti.Vector([0.0] * 8)
+        for o in range(8):
+            s = corner_slot(keys, q, o, slot)
+            if s >= 0:
+                present[o] = 1.0
+                for a in range(rank):
+                    F[o * rank + a] = latents[s, a, 0]
+        for r in range(basis.shape[0]):
+            value, weight = 0.0, 0.0
+            for a in range(8 * rank):
+                value += basis[r, a] * F[a]
+            for o in range(8):
+                weight += tents[r, o] * present[o]
+            sdf[q, r] = value / weight if weight > 1e-5 else UNKNOWN

@@ -1,0 +1,290 @@
+"""The l x l regression of every touched voxel, and its fusion into the map (Eq. 6, 17, 18 and 19).
+
+`F = (P^T W P + d I)^-1 P^T W Y` is Eq. 6 in its primal form: P holds a row f_posi(t) for every sample in the doubled voxel, W
+the number of points behind it. The targets Y ride along as further rows of P^T, so that one Gram product gives both
+P^T W P and Y^T W P, and the forward half of the solve falls out of the Cholesky factorisation.
+
+Sizes are multiples of 4 (`size` for l, `rows` for l plus targets; padding is zero): everything runs in 4x4 patches that stay
+in registers. A *worker* is a thread with a scratch tile of its own that takes a run of voxels.
+"""
+
+import taichi as ti
+
+from .encoding import position_features, position_gradient
+from .voxels import CELLS, INDEX_HALF, Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, row3
+
+PATCH = 4
+TILE = 128  # samples whose features are held at once: the products run over this contiguous axis
+
+
+@ti.func
+def neighbor_block(ijk: ti.template(), o: ti.i32, frame: ti.i32, stamp: ti.template(), block: ti.template()):
+    """Block number of neighbour o of 0..26 of voxel ijk, or -1, and its step (-1, 0, 1) per axis."""
+    step = ti.Vector([o // 9 - 1, o // 3 % 3 - 1, o % 3 - 1])
+    at = ti.math.clamp(ijk + step, -INDEX_HALF, INDEX_HALF - 1) + INDEX_HALF
+    found = -1
+    if stamp[at] == frame:
+        found = block[at]
+    return found, step
+
+
+@ti.func
+def cell_row(cell: ti.i32, step: ti.template()) -> ti.i32:
+    """Row in the feature table of a neighbour's cell: its place among the 8^3 cells of the doubled voxel."""
+    cube = ti.Vector([cell >> 4, cell >> 2 & 3, cell & 3]) + CELLS * step + CELLS // 2
+    return (cube[0] << 6) + (cube[1] << 3) + cube[2]
+
+
+@ti.func
+def add_tile(size: ti.template(), rows: ti.template(), worker: ti.i32, filled: ti.i32, tiles: ti.template(), G: ti.template()):
+    """G += P W P^T over the `filled` samples in a worker's tile, whose columns are zero up to the next multiple of 16."""
+    length = (filled + 15) // 16 * 16
+    for i in range(rows // PATCH):
+        for j in range(ti.min(i + 1, size // PATCH)):
+            sums = ti.Vector([0.0] * (PATCH * PATCH))
+            for k in range(length):
+                for a in ti.static(range(PATCH)):
+                    for b in ti.static(range(PATCH)):
+                        sums[a * PATCH + b] += tiles[worker, i * PATCH + a, k] * tiles[worker, j * PATCH + b, k]
+            for a in ti.static(range(PATCH)):
+                for b in ti.static(range(PATCH)):
+                    G[(i * PATCH + a) * size + j * PATCH + b] += sums[a * PATCH + b]
+
+
+@ti.func
+def flush(size: ti.template(), rows: ti.template(), worker: ti.i32, filled: ti.i32, tiles: ti.template(), G: ti.template()):
+    """Add what a worker's tile holds to G, first clearing the columns that round it up to a multiple of 16."""
+    for row in range(rows):
+        for k in range(filled, (filled + 15) // 16 * 16):
+            tiles[worker, row, k] = 0.0
+    add_tile(size, rows, worker, filled, tiles, G)
+
+
+@ti.func
+def cholesky_solve(size: ti.template(), rows: ti.template(), width: ti.template(), noise: ti.f32, G: ti.template()):
+    """Solve (G + noise I) F = R, where R^T stands in the `width` rows of G below its first `size`; F^T replaces it."""
+    for J in range(size // PATCH):
+        for I in range(J, rows // PATCH):
+            s = ti.Vector([0.0] * (PATCH * PATCH))
+            for a in ti.static(range(PATCH)):
+                for b in ti.static(range(PATCH)):
+                    s[a * PATCH + b] = G[(I * PATCH + a) * size + J * PATCH + b]
+            for k in range(PATCH * J):
+                for a in ti.static(range(PATCH)):
+                    for b in ti.static(range(PATCH)):
+                        s[a * PATCH + b] -= G[(I * PATCH + a) * size + k] * G[(J * PATCH + b) * size + k]
+            if I == J:  # factor the patch; its diagonal keeps the inverse pivots
+                for c in ti.static(range(PATCH)):
+                    pivot = s[c * PATCH + c] + noise
+                    for k in ti.static(range(c)):
+                        pivot -= s[c * PATCH + k] * s[c * PATCH + k]
+                    s[c * PATCH + c] = 1.0 / ti.sqrt(ti.max(pivot, 1e-12))
+                    for r in ti.static(range(c + 1, PATCH)):
+                        for k in ti.static(range(c)):
+                            s[r * PATCH + c] -= s[r * PATCH + k] * s[c * PATCH + k]
+                        s[r * PATCH + c] *= s[c * PATCH + c]
+            else:
+                for c in ti.static(range(PATCH)):
+                    for a in ti.static(range(PATCH)):
+                        for k in ti.static(range(c)):
+                            s[a * PATCH + c] -= s[a * PATCH + k] * G[(J * PATCH + c) * size + J * PATCH + k]
+                        s[a * PATCH + c] *= G[(J * PATCH + c) * size + J * PATCH + c]
+            for a in ti.static(range(PATCH)):
+                for b in ti.static(range(PATCH)):
+                    G[(I * PATCH + a) * size + J * PATCH + b] = s[a * PATCH + b]
+    for back in range(size):
+        i = size - 1 - back
+        s = ti.Vector([0.0] * width)
+        for c in ti.static(range(width)):
+            s[c] = G[(size + c) * size + i]
+        for k in range(i + 1, size):
+            for c in ti.static(range(width)):
+                s[c] -= G[k * size + i] * G[(size + c) * size + k]
+        for c in ti.static(range(width)):
+            G[(size + c) * size + i] = s[c] * G[i * size + i]
+
+
+@ti.func
+def solve_voxel(
+    # in:
+    v: ti.i32, rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
+    noise: ti.f32, weight: ti.f32, mean: ti.template(), G: ti.template(),
+    # out:
+    latents: ti.template(), weights: ti.template(),
+):
+    """F of one voxel from its Gram matrix; with a prior mean m, regress y - m and keep m as one more row."""
+    if ti.static(centered):  # P^T W (Y - 1 m) = R - (P^T W 1) m; the row of ones follows the targets
+        for c in ti.static(range(channels)):
+            mean[c] /= weight
+        for a in range(size):
+            for c in ti.static(range(channels)):
+                G[(size + c) * size + a] -= G[(size + channels) * size + a] * mean[c]
+    cholesky_solve(size, rows, channels, noise, G)
+    weights[v] = weight
+    for a in range(rank):
+        for c in ti.static(range(channels)):
+            latents[v, a, c] = G[(size + c) * size + a]
+    if ti.static(centered):
+        for c in ti.static(range(channels)):
+            latents[v, rank, c] = mean[c]
+
+
+@ti.kernel
+def encode_cells(
+    # in:
+    rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
+    derivatives: ti.template(),
+    stamp: ti.template(), block: ti.template(), frame: ti.i32,
+    blocks: ti.i32,
+    keys: Ints2,         # (B, 3)
+    masks: Masks2,       # (B, 2) occupied cells
+    doubled: Masks2,     # (27, 2) cells of each neighbour that lie in the doubled voxel
+    totals: Ints1,       # (B,) points in the block itself
+    starts: Ints1,       # (B,) first row of each block in `cells`
+    cells: Floats2,      # (M, 1 + c [+ 3]) root of the count, then the mean targets, and normals if `derivatives`, times it
+    features: Floats3,   # (8^3, 1 or 4, size) f_posi, and 1/2 df/dt if `derivatives`, at the cell centres of a doubled voxel
+    minimum: ti.i32,     # blocks with fewer points are not encoded
+    noise: ti.f32,       # d of Eq. 6, in units of the kernel's variance
+    workers: ti.i32,
+    stride: ti.i32,      # loop iterations a worker: the CPU cuts loops into chunks of at least 512
+    # out:
+    tiles: ti.template(),  # (W, rows, TILE) scratch
+    latents: Floats3,    # (B, l [+ 1], c) F, then the prior mean
+    weights: Floats1,    # (B,) points in the doubled voxel, 0 where not encoded
+):
+    for i in range(workers * stride):
+        if i % stride == 0:
+            worker = i // stride
+            for v in range(worker * blocks // workers, (worker + 1) * blocks // workers):
+                weights[v] = 0.0
+                if totals[v] >= minimum:
+                    G = ti.Vector([0.0] * (rows * size))
+                    mean = ti.Vector([0.0] * channels)
+                    ijk = row3(keys, v)
+                    filled, weight = 0, 0.0
+                    for o in range(27):
+                        b, step = neighbor_block(ijk, o, frame, stamp, block)
+                        if b >= 0:
+                            first = starts[b]
+                            for half in range(2):
+                                occupied = masks[b, half]
+                                wanted = occupied & doubled[o, half]
+                                while wanted != 0:
+                                    k = ti.math.clz(ti.cast(wanted, ti.i32))
+                                    wanted ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
+                                    n = first + ti.math.popcnt((occupied >> 1) >> ti.cast(31 - k, ti.u32))
+                                    at = cell_row(half * 32 + k, step)
+                                    root = cells[n, 0]
+                                    for a in ti.static(range(size)):
+                                        tiles[worker, a, filled] = features[at, 0, a] * root
+                                    for c in ti.static(range(channels)):
+                                        y = cells[n, 1 + c]
+                                        tiles[worker, size + c, filled] = y
+                                        mean[c] += y * root
+                                    if ti.static(centered):
+                                        tiles[worker, size + channels, filled] = root
+                                    filled += 1
+                                    if ti.static(derivatives):  # Eq. 16: one more row an axis, its target the normal
+                                        for axis in ti.static(range(3)):
+                                            for a in ti.static(range(size)):
+                                                tiles[worker, a, filled] = features[at, 1 + axis, a] * root
+                                            tiles[worker, size, filled] = cells[n, 2 + axis]
+                                            filled += 1
+                                    weight += root * root
+                                    if filled > TILE - 4:
+                                        flush(size, rows, worker, filled, tiles, G)
+                                        filled = 0
+                                first += ti.cast(ti.math.popcnt(occupied), ti.i32)
+                    if filled > 0:
+                        flush(size, rows, worker, filled, tiles, G)
+                    solve_voxel(v, rank, size, rows, channels, centered, noise, weight, mean, G, latents, weights)
+
+
+@ti.kernel
+def encode_points(
+    # in:
+    rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
+    derivatives: ti.template(),
+    stamp: ti.template(), block: ti.template(), frame: ti.i32,
+    blocks: ti.i32,
+    keys: Ints2,          # (B, 3)
+    starts: Ints1,        # (B + 1,) first sample of each block
+    samples: Floats2,     # (N, 3) [voxels], sorted by block
+    targets: Floats2,     # (N, c [+ 3]) targets, and normals if `derivatives`
+    anchors: Floats2,     # (3, A)
+    projection: Floats2,  # (l, A)
+    scale: ti.f32,
+    minimum: ti.i32,
+    noise: ti.f32,
+    workers: ti.i32, stride: ti.i32,
+    # out:
+    tiles: ti.template(), latents: Floats3, weights: Floats1,  # as encode_cells
+):
+    for i in range(workers * stride):
+        if i % stride == 0:
+            worker = i // stride
+            for row in range(rows):
+                for k in range(TILE):
+                    tiles[worker, row, k] = 0.0
+            for v in range(worker * blocks // workers, (worker + 1) * blocks // workers):
+                weights[v] = 0.0
+                if starts[v + 1] - starts[v] >= minimum:
+                    G = ti.Vector([0.0] * (rows * size))
+                    mean = ti.Vector([0.0] * channels)
+                    ijk = row3(keys, v)
+                    filled, weight = 0, 0.0
+                    for o in range(27):
+                        b, step = neighbor_block(ijk, o, frame, stamp, block)
+                        if b >= 0:
+                            for n in range(starts[b], starts[b + 1]):
+                                t = (row3(samples, n) - ijk - 0.5) * 0.5
+                                if ti.abs(t).max() <= 0.5:
+                                    f = position_features(t, rank, anchors, projection, scale)
+                                    for a in ti.static(range(rank)):
+                                        tiles[worker, a, filled] = f[a]
+                                    for c in ti.static(range(channels)):
+                                        tiles[worker, size + c, filled] = targets[n, c]
+                                        mean[c] += targets[n, c]
+                                    if ti.static(centered):
+                                        tiles[worker, size + channels, filled] = 1.0
+                                    filled += 1
+                                    if ti.static(derivatives):
+                                        for axis in range(3):
+                                            g = position_gradient(t, axis, rank, anchors, projection, scale)
+                                            for a in ti.static(range(rank)):
+                                                tiles[worker, a, filled] = 0.5 * g[a]  # d/dx = 1/2 d/dt
+                                            tiles[worker, size, filled] = targets[n, 1 + axis]
+                                            filled += 1
+                                    weight += 1.0
+                                    if filled > TILE - 4:
+                                        flush(size, rows, worker, filled, tiles, G)
+                                        filled = 0
+                    if filled > 0:
+                        flush(size, rows, worker, filled, tiles, G)
+                    solve_voxel(v, rank, size, rows, channels, centered, noise, weight, mean, G, latents, weights)
+
+
+@ti.kernel
+def fuse(
+    # in:
+    voxels: ti.i32,
+    slots: Ints1,             # (B,) slot in the map, -1 where none
+    latents: Floats3,         # (B, r, c) F'
+    weights: Floats1,         # (B,) w'
+    masks: Masks2,            # (B, 2) support
+    # out:
+    map_latents: Floats3,     # (S, r, c) F <- (F w + F' w') / (w + w')
+    map_weights: Floats1,     # (S,) w <- w + w'
+    map_masks: Masks2,        # (S, 2) |=
+):
+    for v in range(voxels):
+        s = slots[v]
+        if s >= 0:
+            old, new = map_weights[s], weights[v]
+            share = new / (old + new)
+            for a in range(latents.shape[1]):
+                for c in range(latents.shape[2]):
+                    map_latents[s, a, c] += (latents[v, a, c] - map_latents[s, a, c]) * share
+            map_weights[s] = old + new
+            for half in ti.static(range(2)):
+                map_masks[s, half] |= masks[v, half]

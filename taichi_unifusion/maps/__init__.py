@@ -1,0 +1,36 @@
+"""Latent Implicit Maps (Fig. 5). Names load when they are used: the settings need no Taichi, the maps do."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .base_map import BaseMap, Integration
+    from .property_map import PropertyMap
+    from .settings import MapSettings, PropertySettings, SurfaceSettings
+    from .surface_map import SurfaceMap
+
+__all__ = ["BaseMap", "Integration", "MapSettings", "PropertyMap", "PropertySettings", "SurfaceMap", "SurfaceSettings", "load_map"]
+
+_MODULES = {"BaseMap": "base_map", "Integration": "base_map", "PropertyMap": "property_map", "SurfaceMap": "surface_map",
+            "MapSettings": "settings", "PropertySettings": "settings", "SurfaceSettings": "settings"}
+
+
+def load_map(path: str | Path) -> BaseMap:
+    """The map in a file, of whatever kind it is; raises MapCorrupt or FileError."""
+    for module in ("property_map", "surface_map"):  # a kind of map registers itself when its module loads
+        import_module(f".{module}", __name__)
+    return __getattr__("BaseMap").load(path)
+
+
+def __getattr__(name: str):
+    if name not in _MODULES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    value = globals()[name] = getattr(import_module(f".{_MODULES[name]}", __name__), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

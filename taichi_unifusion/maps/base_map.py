@@ -1,0 +1,158 @@
+"""BaseMap: a Latent Implicit Map, sparse voxels (F, w) fused frame by frame (Sec. IV-A, IV-E; Fig. 5)."""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import runtime
+from ..encoding import EncoderSettings, position_encoding
+from ..errors import InputError, MapCorrupt
+from ..kernels import regression, voxels
+from ..map_files import read_map, write_map
+from ..types import PointCloud
+from .frame_blocks import FrameBlocks
+from .regressor import Regressor
+from .settings import MapSettings
+from .voxel_grid import VoxelData, VoxelGrid
+
+
+@dataclass(frozen=True)
+class Integration:
+    """What one call of `integrate` did."""
+
+    points: int         # points given
+    voxels: int         # voxels encoded from them
+    total_voxels: int   # voxels in the map afterwards
+
+
+class BaseMap(ABC):
+    """Voxel structure, encoding, fusion, files; a subclass says which (x, y) pairs a cloud gives."""
+
+    kind: str                      # name of the class of map in files
+    settings_type: type[MapSettings]
+    registry: dict[str, type[BaseMap]] = {}
+
+    def __init_subclass__(cls) -> None:
+        BaseMap.registry[cls.kind] = cls
+
+    def __init__(self, name: str, channels: int, settings: MapSettings, *, centered: bool, derivatives: bool) -> None:
+        self.name, self.channels, self.settings = name, channels, settings
+        self._centered = centered
+        self._grid = VoxelGrid(settings.encoder.rank + centered, channels)
+        self._regressor = Regressor(position_encoding(settings.encoder), self._grid, voxel_size=settings.voxel_size,
+                                    channels=channels, centered=centered, derivatives=derivatives, noise=settings.noise, min_points=settings.min_points)
+
+    @property
+    def voxel_size(self) -> float:
+        """Edge of a voxel [m]."""
+        return self.settings.voxel_size
+
+    def __len__(self) -> int:
+        """Number of voxels."""
+        return self._grid.count
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the voxels and their index."""
+        return self._grid.memory_bytes
+
+    def integrate(self, cloud: PointCloud) -> Integration:
+        """Fuse a cloud in world coordinates into the map.
+
+        A cloud without points changes nothing. Raises InputError where the cloud lacks what the map needs, OutOfRange for
+        points beyond the index range, CapacityError where the map would grow beyond safe memory; the map is then unchanged.
+        """
+        runtime.check_alive(self._grid.runtime)
+        self._check(cloud)
+        if len(cloud) == 0:
+            return Integration(0, 0, len(self))
+        encode = self._encode_cells if self.settings.sampling == "cells" else self._encode_points
+        blocks = encode(cloud)                       # local LIM: F', w' of every voxel that the cloud touches
+        encoded = self._regressor.fuse(blocks)       # global LIM, Eq. 19
+        return Integration(len(cloud), encoded, len(self))
+
+    @abstractmethod
+    def _check(self, cloud: PointCloud) -> None:
+        """Raise InputError unless the cloud has what this map needs."""
+
+    @abstractmethod
+    def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
+        """Encode from cell averages; returns the blocks, whose masks hold the support."""
+
+    @abstractmethod
+    def _encode_points(self, cloud: PointCloud) -> FrameBlocks:
+        """Encode from every point; returns as `_encode_cells`."""
+
+    def _encode_samples(self, blocks: FrameBlocks, samples: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
+        """Encode samples (N, 3) world [m] with targets (N, c), each as it is, after touching their voxels."""
+        blocks.touch(samples, self.voxel_size)
+        block_of = np.empty(len(samples), np.int32)
+        voxels.block_of_points(samples, 1.0 / self.voxel_size, self._grid.block, block_of)
+        order = np.argsort(block_of, kind="stable")
+        starts = np.searchsorted(block_of[order], np.arange(blocks.count + 1)).astype(np.int32)
+        self._regressor.encode_points(blocks, starts, samples[order] / np.float32(self.voxel_size),
+                                      np.ascontiguousarray(targets[order], dtype=np.float32))
+
+    def merge(self, other: BaseMap) -> None:
+        """Fuse another map of the same settings into this one (Eq. 19 is associative); raises InputError where they differ."""
+        if (other.kind, other.name, other.channels, other.settings) != (self.kind, self.name, self.channels, self.settings):
+            raise InputError(f"merge: the maps differ: {self.kind} '{self.name}' x{self.channels} {self.settings} and "
+                             f"{other.kind} '{other.name}' x{other.channels} {other.settings}")
+        self._fuse_data(other._grid.export())
+
+    def _fuse_data(self, data: VoxelData) -> None:
+        n = len(data.keys)
+        if n:
+            slots = np.empty(n, np.int32)
+            self._grid.claim(n, data.keys, data.weights, slots)
+            regression.fuse(n, slots, data.latents, data.weights, data.masks,
+                            self._grid.latents, self._grid.weights, self._grid.masks)
+
+    def save(self, path: str | Path) -> None:
+        """Write the map to one file; readable on any device. Raises FileError where that fails; an old file then stays."""
+        data = self._grid.export()
+        write_map(Path(path), {"keys": data.keys, "latents": data.latents, "weights": data.weights, "masks": data.masks},
+                  {"kind": self.kind, "name": self.name, "channels": self.channels, "voxels": len(self),
+                   "fusion": "mean", "settings": dataclasses.asdict(self.settings)})
+
+    @classmethod
+    def load(cls, path: str | Path) -> BaseMap:
+        """Read a map written by `save`; raises MapCorrupt or FileError. `BaseMap.load` reads any kind of map."""
+        tensors, manifest = read_map(Path(path))
+        target = BaseMap.registry.get(manifest.get("kind"))
+        if target is None or not issubclass(target, cls):
+            raise MapCorrupt(f"{path}: holds a map of kind '{manifest.get('kind')}', not '{getattr(cls, 'kind', 'any')}'")
+        data = VoxelData(*(tensors.get(key) for key in ("keys", "latents", "weights", "masks")))
+        try:
+            values = dict(manifest["settings"])
+            settings = target.settings_type(**{**values, "encoder": EncoderSettings(**values["encoder"])})
+            restored = target._restore(manifest["name"], int(manifest["channels"]), settings)
+        except (KeyError, TypeError, InputError) as error:
+            raise MapCorrupt(f"{path}: its manifest does not describe a map ({error}); write it again") from error
+        restored._check_data(path, data)
+        restored._fuse_data(data)
+        return restored
+
+    @classmethod
+    @abstractmethod
+    def _restore(cls, name: str, channels: int, settings: MapSettings) -> BaseMap:
+        """An empty map as described by a file's manifest."""
+
+    def _check_data(self, path: str | Path, data: VoxelData) -> None:
+        n = -1 if data.keys is None else len(data.keys)
+        wanted = {"keys": ((n, 3), np.int32), "latents": ((n, self._grid.rows, self.channels), np.float32),
+                  "weights": ((n,), np.float32), "masks": ((n, 2), np.uint32)}
+        for name, (shape, dtype) in wanted.items():
+            array = getattr(data, name)
+            if array is None or array.shape != shape or array.dtype != dtype:
+                found = "nothing" if array is None else f"{array.shape} {array.dtype}"
+                raise MapCorrupt(f"{path}: tensor '{name}' should be {shape} {np.dtype(dtype)}, found {found}; write the map again")
+        if n and not (np.abs(data.keys.astype(np.int64)).max() < voxels.INDEX_HALF and np.isfinite(data.weights).all()
+                      and (data.weights > 0).all() and np.isfinite(data.latents).all()):
+            raise MapCorrupt(f"{path}: holds voxels out of range or numbers that are not finite; write the map again")

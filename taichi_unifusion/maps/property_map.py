@@ -1,0 +1,67 @@
+"""PropertyMap: any property of the surface as a LIM (Sec. IV-C)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import runtime
+from ..errors import InputError
+from ..kernels import query
+from ..types import PointCloud
+from .base_map import BaseMap
+from .frame_blocks import FrameBlocks
+from .settings import PropertySettings
+
+
+class PropertyMap(BaseMap):
+    """A continuous field of `channels` values on the surface, fused from the attribute `name` of point clouds.
+
+        color = PropertyMap("color", channels=3, voxel_size=0.02)
+        color.integrate(cloud)                    # cloud.attributes["color"]: (N, 3)
+        rgb = color.query(mesh.vertices)          # (V, 3)
+
+    Keywords are those of `PropertySettings`.
+    """
+
+    kind = "property"
+    settings_type = PropertySettings
+
+    def __init__(self, name: str, channels: int, settings: PropertySettings | None = None, **overrides) -> None:
+        settings = dataclasses.replace(settings or PropertySettings(), **overrides)
+        if channels < 1:
+            raise InputError(f"property map '{name}': channels must be at least 1, got {channels}")
+        super().__init__(name, channels, settings, centered=settings.prior == "mean", derivatives=False)
+        self._cells = FrameBlocks(self._grid, channels, with_positions=False)
+
+    @classmethod
+    def _restore(cls, name: str, channels: int, settings: PropertySettings) -> PropertyMap:
+        return cls(name, channels, settings)
+
+    def _check(self, cloud: PointCloud) -> None:
+        values = cloud.attributes.get(self.name)
+        if values is None:
+            raise InputError(f"property map '{self.name}': the cloud has no attribute '{self.name}', only "
+                             f"{', '.join(sorted(cloud.attributes)) or 'none'}")
+        if values.shape[1] != self.channels:
+            raise InputError(f"property map '{self.name}': expected {self.channels} channels, the cloud has {values.shape[1]}")
+
+    def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
+        self._cells.touch(cloud.points, self.voxel_size)
+        self._cells.bin(cloud.points, cloud.attributes[self.name], self.voxel_size)
+        self._cells.compact(1)
+        self._regressor.encode_cells(self._cells)
+        return self._cells
+
+    def _encode_points(self, cloud: PointCloud) -> FrameBlocks:
+        self._encode_samples(self._cells, cloud.points, cloud.attributes[self.name])
+        self._cells.bin_support(cloud.points, self.voxel_size, 1)
+        return self._cells
+
+    def query(self, points: NDArray, return_valid: bool = False):
+        """Property values (N, c) float32 at points (N, 3) world [m], 0 where no voxel reaches; optionally also that mask (N,)."""
+        runtime.check_alive(self._grid.runtime)
+        values, valid = self._regressor.query(points, blend=self.settings.blend)
+        return (values, valid) if return_valid else values

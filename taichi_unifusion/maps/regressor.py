@@ -1,0 +1,118 @@
+"""Device side of the position encoding and the per-voxel regression: constant tables, scratch, and the launches."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from ..encoding import PositionEncoding
+from ..errors import InputError
+from ..kernels import query
+from ..kernels import regression as kernels
+from ..kernels.voxels import CELLS
+from .frame_blocks import FrameBlocks
+from .voxel_grid import VoxelGrid
+
+CPU_WORKERS, CPU_STRIDE = 64, 512  # Taichi cuts a CPU loop into chunks of at least 512 iterations: a worker per chunk
+GPU_WORKERS, GPU_STRIDE = 8192, 1
+
+
+class Regressor:
+    """Encodes the blocks of a frame: F, w for every voxel with enough samples in it."""
+
+    def __init__(self, encoding: PositionEncoding, grid: VoxelGrid, *, voxel_size: float, channels: int, centered: bool, derivatives: bool,
+                 noise: float, min_points: int) -> None:
+        self.encoding, self.grid = encoding, grid
+        self.channels, self.centered, self.derivatives = channels, centered, derivatives
+        self.voxel_size, self.noise, self.min_points = voxel_size, noise, min_points
+        self.rank = encoding.settings.rank
+        self.size = _round_up(self.rank)
+        self.rows = self.size + _round_up(channels + centered)
+        self.scale = float(np.sqrt(7.0) / encoding.settings.length_scale)
+        self.anchors = _to_device((encoding.anchors * self.scale).T)
+        self.projection = _to_device(encoding.projection.T)
+        self.cell_features = _to_device(self._cell_features())
+        on_cpu = grid.runtime.device == "cpu"
+        self.workers, self.stride = (CPU_WORKERS, CPU_STRIDE) if on_cpu else (GPU_WORKERS, GPU_STRIDE)
+        self.doubled = ti.ndarray(ti.u32, (27, 2))
+        self.doubled.from_numpy(_doubled_masks())
+        self.tiles = ti.field(ti.f32, (self.workers, self.rows, kernels.TILE))  # a field: its strides are known when compiling
+        self.latents = ti.ndarray(ti.f32, (1, 1, 1))
+        self.weights = ti.ndarray(ti.f32, (1,))
+        self.slots = ti.ndarray(ti.i32, (1,))
+
+    def _cell_features(self) -> NDArray[np.float64]:
+        """(8^3, 1 or 4, size): f_posi, and its gradient by voxel units, at the cell centres of a doubled voxel."""
+        t = self.encoding.nodes(2 * CELLS)
+        table = np.zeros((len(t), 4 if self.derivatives else 1, self.size))
+        table[:, 0, :self.rank] = self.encoding(t)
+        if self.derivatives:
+            table[:, 1:, :self.rank] = 0.5 * self.encoding.gradient(t)  # t moves by 1/2 a voxel
+        return table
+
+    def _reserve(self, blocks: int) -> None:
+        if blocks > self.weights.shape[0]:
+            room = blocks * 5 // 4
+            self.latents = ti.ndarray(ti.f32, (room, self.grid.rows, self.channels))
+            self.weights = ti.ndarray(ti.f32, (room,))
+            self.slots = ti.ndarray(ti.i32, (room,))
+
+    def encode_cells(self, blocks: FrameBlocks) -> None:
+        """Encode from the blocks' compacted cells."""
+        self._reserve(blocks.count)
+        kernels.encode_cells(self.rank, self.size, self.rows, self.channels, self.centered, self.derivatives,
+                             self.grid.stamp, self.grid.block, blocks.frame, blocks.count, blocks.keys, blocks.masks, self.doubled,
+                             blocks.totals, blocks.starts, blocks.cells, self.cell_features, self.min_points, self.noise, self.workers, self.stride,
+                             self.tiles, self.latents, self.weights)
+
+    def encode_points(self, blocks: FrameBlocks, starts: NDArray[np.int32], samples: NDArray[np.float32],
+                      targets: NDArray[np.float32]) -> None:
+        """Encode from single samples (N, 3) [voxels] with targets (N, c), both sorted by block; block b has starts[b:b+2]."""
+        self._reserve(blocks.count)
+        kernels.encode_points(self.rank, self.size, self.rows, self.channels, self.centered, self.derivatives,
+                              self.grid.stamp, self.grid.block, blocks.frame, blocks.count, blocks.keys, starts, samples, targets,
+                              self.anchors, self.projection, self.scale, self.min_points, self.noise, self.workers, self.stride,
+                              self.tiles, self.latents, self.weights)
+
+    def query(self, points: NDArray, blend: bool) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Decoded values (N, c) and where they are valid (N,), at points (N, 3) world [m] (Eq. 7)."""
+        points = np.ascontiguousarray(points, dtype=np.float32)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"query: points must be (N, 3), got {points.shape}")
+        values, valid = np.zeros((len(points), self.channels), np.float32), np.zeros(len(points), np.uint8)
+        if len(points):
+            query.query_points(self.rank, self.channels, self.centered, blend, points, 1.0 / self.voxel_size, self.grid.slot,
+                               self.grid.latents, self.anchors, self.projection, self.scale, values, valid)
+        return values, valid.astype(bool)
+
+    def fuse(self, blocks: FrameBlocks) -> int:
+        """Fuse what was encoded into the map (Eq. 19), with the blocks' support; returns the number of voxels encoded."""
+        encoded = self.grid.claim(blocks.count, blocks.keys, self.weights, self.slots)
+        kernels.fuse(blocks.count, self.slots, self.latents, self.weights, blocks.support,
+                     self.grid.latents, self.grid.weights, self.grid.masks)
+        return encoded
+
+
+def _doubled_masks() -> NDArray[np.uint32]:
+    """(27, 2): the cells of each of the 27 neighbours that lie in the doubled voxel, as bits in the order of `occupancy`."""
+    halves = {-1: range(CELLS // 2, CELLS), 0: range(CELLS), 1: range(CELLS // 2)}
+    masks = np.zeros((27, 2), np.uint32)
+    for o, steps in enumerate(product((-1, 0, 1), repeat=3)):
+        for i, j, k in product(*(halves[step] for step in steps)):
+            cell = (i * CELLS + j) * CELLS + k
+            masks[o, cell // 32] |= np.uint32(1 << (31 - cell % 32))
+    return masks
+
+
+def _round_up(n: int) -> int:
+    return -(-n // kernels.PATCH) * kernels.PATCH
+
+
+def _to_device(array: NDArray) -> ti.Ndarray:
+    array = np.ascontiguousarray(array, dtype=np.float32)
+    on_device = ti.ndarray(ti.f32, array.shape)
+    on_device.from_numpy(array)
+    return on_device

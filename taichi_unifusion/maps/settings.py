@@ -1,0 +1,78 @@
+"""What a map can be told: the settings are checked here, shown by `--help`, and saved with every map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ..encoding import EncoderSettings
+from ..errors import InputError
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """Settings that every Latent Implicit Map has."""
+
+    voxel_size: float = 0.05
+    """Voxel edge in metres; a latent describes a cube of twice this edge."""
+    noise: float = 1.0
+    """Observation noise d of the regression (Eq. 6) relative to the kernel's variance; larger is smoother."""
+    min_points: int = 4
+    """Voxels with fewer samples in a frame are left out of that frame."""
+    sampling: Literal["cells", "points"] = "cells"
+    """cells: average a frame's points in 4x4x4 cells a voxel before the regression (fast); points: every point as it is (the paper)."""
+    encoder: EncoderSettings = field(default_factory=EncoderSettings)
+    """The position encoding."""
+
+    def __post_init__(self) -> None:
+        if not 1e-4 <= self.voxel_size <= 100:
+            raise InputError(f"voxel_size: must lie between 0.0001 and 100 metres, got {self.voxel_size}")
+        if self.noise <= 0:
+            raise InputError(f"noise: must be positive, got {self.noise}")
+        if self.min_points < 1:
+            raise InputError(f"min_points: must be at least 1, got {self.min_points}")
+        _check_choice("sampling", self.sampling, ("cells", "points"))
+
+
+@dataclass(frozen=True)
+class SurfaceSettings(MapSettings):
+    """Settings of the surface map (Sec. IV-B)."""
+
+    gpis: Literal["samples", "derivatives"] = "samples"
+    """samples: points on and beside the surface carry signed distances; derivatives: points carry their normals (Eq. 14-17)."""
+    sample_distance: float = 0.15
+    """Distance of the off-surface samples along the normal, in voxels (d_s)."""
+    support_points: int = 3
+    """A 1/4-voxel cell counts as seen once this many points of one frame fell into it; surface is extracted only near such cells."""
+
+    support_reach: int = 0
+    """How many cells beyond seen cells surface may be extracted."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.sample_distance <= 1:
+            raise InputError(f"sample_distance: must lie in (0, 1] voxels, got {self.sample_distance}")
+        if self.support_points < 0:
+            raise InputError(f"support_points: must not be negative, got {self.support_points}")
+        _check_choice("gpis", self.gpis, ("samples", "derivatives"))
+
+
+@dataclass(frozen=True)
+class PropertySettings(MapSettings):
+    """Settings of a property map (Sec. IV-C)."""
+
+    voxel_size: float = 0.02
+    """Voxel edge in metres; a latent describes a cube of twice this edge."""
+    prior: Literal["mean", "zero"] = "mean"
+    """What the field falls back to where a voxel has no data: the voxel's mean, or zero as published."""
+    blend: bool = True
+    """Decode from all voxels that contain a point, with tent weights; off: from its own voxel only, as published."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_choice("prior", self.prior, ("mean", "zero"))
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise InputError(f"{name}: '{value}' is unknown, choose one of {', '.join(choices)}")

@@ -1,0 +1,124 @@
+"""Sparse voxel storage: a Taichi pointer tree as the index, pools addressed by slot as the data (Sec. IV-A).
+
+The tree spans 16,384 voxels an axis around the origin (819 m at 5 cm) and holds, per voxel, its slot and which block of which
+frame it is. Latents, weights and support masks lie in dense pools that double when they are full.
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from .. import runtime
+from ..errors import CapacityError
+from ..kernels import voxels as kernels
+
+SPARSE_LIMIT = 1 << 30       # bytes of sparse nodes: Taichi's CPU pool fails silently somewhat above 1.6 GB
+BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16  # a 4^3 leaf with three i32 fields and its share of the nodes above it
+FIRST_CAPACITY = 4096
+
+
+def _build_tree() -> tuple:
+    """Fields slot, stamp and block of a new index tree, and the node above its leaves."""
+    fields = tuple(ti.field(ti.i32) for _ in range(3))
+    builder = ti.FieldsBuilder()
+    node = builder.pointer(ti.ijk, 64)
+    for _ in range(3):
+        node = node.pointer(ti.ijk, 4)
+    node.bitmasked(ti.ijk, 4).place(*fields)
+    builder.finalize()
+    return *fields, node
+
+
+@dataclass(frozen=True)
+class VoxelData:
+    """Voxels by value, sorted by index: what maps save, load and merge."""
+
+    keys: NDArray[np.int32]       # (N, 3) voxel index
+    latents: NDArray[np.float32]  # (N, r, c)
+    weights: NDArray[np.float32]  # (N,)
+    masks: NDArray[np.uint32]     # (N, 2) support
+
+
+class VoxelGrid:
+    """Voxels of one map: index tree and pools."""
+
+    def __init__(self, rows: int, channels: int) -> None:
+        self.runtime = runtime.current()
+        self.rows, self.channels = rows, channels
+        self.count = 0
+        self.frame = 0
+        self._tree = self._borrow_tree()
+        self.slot, self.stamp, self.block, self.leaf_parent = self._tree
+        self._allocate(FIRST_CAPACITY)
+        self._leaves, self._count_at_check = 0, 0
+
+    def _borrow_tree(self) -> tuple:
+        """An empty index tree: one that a map no longer uses, else a new one. Taichi never frees the memory of a tree."""
+        free = self.runtime.free_trees
+        if free:
+            tree = free.pop()
+            tree[-1].parent(2).deactivate_all()  # the topmost pointer node
+        else:
+            self.runtime.count_tree()
+            tree = _build_tree()
+        weakref.finalize(self, free.append, tree)
+        return tree
+
+    def _allocate(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.keys = ti.ndarray(ti.i32, (capacity, 3))
+        self.latents = ti.ndarray(ti.f32, (capacity, self.rows, self.channels))
+        self.weights = ti.ndarray(ti.f32, (capacity,))
+        self.masks = ti.ndarray(ti.u32, (capacity, 2))
+
+    def next_frame(self) -> int:
+        """A new frame stamp, which makes every block number of earlier frames void."""
+        runtime.check_alive(self.runtime)
+        self.frame += 1
+        return self.frame
+
+    def reserve(self, extra: int) -> None:
+        """Make room for `extra` more voxels; raises CapacityError before sparse memory becomes unsafe."""
+        if self.count > 1.2 * self._count_at_check + 1000:
+            self._leaves, self._count_at_check = int(kernels.count_leaves(self.leaf_parent)), self.count
+        if self._leaves * BYTES_PER_LEAF > SPARSE_LIMIT:
+            raise CapacityError(f"the map holds {self.count:,} voxels and its index would pass 1 GB, where Taichi is no longer "
+                                "safe: use larger voxels or save the map and start a new one")
+        if self.count + extra <= self.capacity:
+            return
+        old = self.keys, self.latents, self.weights, self.masks
+        self._allocate(max(2 * self.capacity, self.count + extra))
+        if self.count:
+            kernels.copy_voxels(self.count, *old, self.keys, self.latents, self.weights, self.masks)
+
+    def claim(self, blocks: int, keys, weights, slots) -> int:
+        """Fill `slots` (B,) with the slot of every block of positive weight, new or known, and -1 elsewhere; counts those."""
+        self.reserve(blocks)
+        counters = np.array([self.count, 0], np.int32)
+        kernels.claim_slots(blocks, keys, weights, self.slot, slots, self.keys, counters)
+        runtime.synchronize()
+        self.count = int(counters[0])
+        return int(counters[1])
+
+    def export(self) -> VoxelData:
+        """All voxels by value, sorted by index (i, then j, then k)."""
+        runtime.check_alive(self.runtime)
+        n = self.count
+        keys = self.keys.to_numpy()[:n]
+        order = np.lexsort(keys.T[::-1]).astype(np.int32)
+        data = VoxelData(np.ascontiguousarray(keys[order]), np.empty((n, self.rows, self.channels), np.float32),
+                         np.empty(n, np.float32), np.empty((n, 2), np.uint32))
+        if n:
+            kernels.gather_voxels(order, self.latents, self.weights, self.masks, data.latents, data.weights, data.masks)
+        return data
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes that the voxels need: pools as far as they are used, and the index tree."""
+        self._leaves = int(kernels.count_leaves(self.leaf_parent)) if self.count else 0
+        return self.count * (12 + 4 + 8 + 4 * self.rows * self.channels) + self._leaves * BYTES_PER_LEAF

@@ -1,0 +1,154 @@
+"""Surface LIM -> welded mesh: the signed distance on a grid around every supported voxel, then marching cubes (Sec. IV-B).
+
+The grid comes in cubes that span the centres of eight neighbouring voxels: within one, the same eight doubled voxels blend,
+so that a cube of samples is one matrix product with their concatenated latents.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .encoding import PositionEncoding
+from .kernels import marching_cubes as kernels
+from .kernels import query
+from .types import Mesh
+
+if TYPE_CHECKING:
+    from .maps.voxel_grid import VoxelGrid
+
+STEPS = np.array(list(product((0, 1), repeat=3)))  # (8, 3) corners of a cube, x slowest
+NORMAL_UNIT = float(1 << 18)                       # fixed-point one of summed normals, in squared grid spacings
+
+
+def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float, resolution: int, support_reach: int | None) -> Mesh:
+    """Zero level of the blended field on `resolution`^3 cells a voxel, only within `support_reach` cells of supported ones unless None."""
+    keys, support = _cubes(grid, support_reach)
+    if not len(keys):
+        return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+    upper = _upper_cubes(keys)
+    sdf = np.empty((len(keys), resolution**3), np.float32)
+    query.sdf_grid(encoding.settings.rank, keys, grid.slot, grid.latents, *grid_basis(encoding, resolution), sdf)
+    vertices, faces = _march(keys, upper, support, sdf, resolution, voxel_size)
+    sums = np.zeros((len(vertices), 3), np.int32)
+    if len(faces):
+        kernels.sum_normals(vertices, faces, NORMAL_UNIT * (resolution / voxel_size) ** 2, sums)
+    normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1)
+    return Mesh(vertices, faces, normals.astype(np.float32))
+
+
+def _cubes(grid: VoxelGrid, support_reach: int | None) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
+    """Sorted keys (Q, 3) of the cubes that hold surface or close one that does, and their support masks (Q, 2)."""
+    data = grid.export()
+    keys = unique_rows((data.keys[:, None] + STEPS).reshape(-1, 3))
+    support = np.full((len(keys), 2), 0xFFFFFFFF, np.uint32)
+    if support_reach is not None and len(keys):
+        query.corner_support(keys, grid.slot, grid.masks, support_reach, support)
+        keys = keys[support.any(axis=1)]
+        keys = unique_rows((keys[:, None] + STEPS).reshape(-1, 3))  # the last cells of a cube need the samples above
+        support = np.empty((len(keys), 2), np.uint32)
+        if len(keys):
+            query.corner_support(keys, grid.slot, grid.masks, support_reach, support)
+    return keys, support
+
+
+def unique_rows(rows: NDArray) -> NDArray[np.int32]:
+    """Distinct integer triples in lexicographic order."""
+    codes = np.unique(_codes(rows))
+    return np.stack([(codes >> s & 0x1FFFFF) - (1 << 20) for s in (42, 21, 0)], axis=1).astype(np.int32)
+
+
+def _codes(rows: NDArray) -> NDArray[np.int64]:
+    """Triples as single integers of the same order."""
+    rows = rows.astype(np.int64) + (1 << 20)
+    return rows[:, 0] << 42 | rows[:, 1] << 21 | rows[:, 2]
+
+
+def _upper_cubes(keys: NDArray[np.int32]) -> NDArray[np.int32]:
+    """(Q, 8) row of the cube at each of STEPS from every cube, -1 where there is none; `keys` are sorted."""
+    codes = _codes(keys)
+    upper = np.empty((len(keys), 8), np.int32)
+    for o, step in enumerate(STEPS):
+        wanted = _codes(keys + step)
+        at = np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)
+        upper[:, o] = np.where(codes[at] == wanted, at, -1)
+    return upper
+
+
+@lru_cache(maxsize=8)
+def grid_basis(encoding: PositionEncoding, resolution: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Tent weight times f_posi (R^3, 8 l), and tent weight (R^3, 8), of the eight voxels at the samples of a cube."""
+    samples = np.stack(np.meshgrid(*[np.arange(resolution) / resolution] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    basis, tents = [], []
+    for step in STEPS:
+        t = (samples - step) / 2  # from the centre of voxel key - 1 + step, which is corner `step` of the cube
+        tents.append(np.prod(1 - 2 * np.abs(t), axis=1))
+        basis.append(tents[-1][:, None] * encoding(t))
+    return np.ascontiguousarray(np.hstack(basis), np.float32), np.ascontiguousarray(np.stack(tents, axis=1), np.float32)
+
+
+def _march(keys, upper, support, sdf, resolution, voxel_size) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Vertices (V, 3) world [m] and faces (F, 3) of the zero level."""
+    counts, flags, table, edge_table = marching_cubes_tables()
+    cases, edges = np.empty(sdf.shape, np.uint8), np.zeros(sdf.shape, np.int32)
+    triangles, on_edges = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
+    kernels.classify_cells(resolution, upper, support, sdf, counts, edge_table, flags, cases, edges, triangles)
+    kernels.count_vertices(edges, on_edges)
+    vertex_starts, triangle_starts = _starts(on_edges), _starts(triangles)
+    vertices, faces = np.empty((on_edges.sum(), 3), np.float32), np.empty((triangles.sum(), 3), np.int32)
+    if len(faces):
+        first = np.empty(sdf.shape, np.int32)
+        kernels.place_vertices(resolution, keys, upper, sdf, edges, vertex_starts, voxel_size, first, vertices)
+        kernels.emit_triangles(resolution, upper, cases, edges, first, triangle_starts, counts, table, edge_table, faces)
+    return vertices, faces
+
+
+def _starts(counts: NDArray[np.int32]) -> NDArray[np.int32]:
+    return (np.cumsum(counts) - counts).astype(np.int32)
+
+
+@lru_cache(maxsize=1)
+def marching_cubes_tables() -> tuple[NDArray[np.int32], ...]:
+    """Triangles of the 256 cases: counts (256,), edge flags (256,), edges (256, 15), and the edges' corner and axis (12, 4).
+
+    Built, not copied: on every face of the cell, segments keep the corners behind the surface together on their own side
+    (also on ambiguous faces, so that neighbours agree); the segments close to loops, and each loop becomes a fan. Triangles
+    are counter-clockwise seen from in front of the surface.
+    """
+    edges = [(o, d) for d in range(3) for o in range(8) if not STEPS[o][d]]     # lower corner, axis
+    edge_of = {frozenset((o, o + (4 >> d))): e for e, (o, d) in enumerate(edges)}
+    counts, flags, table = np.zeros(256, np.int32), np.zeros(256, np.int32), np.zeros((256, 15), np.int32)
+    for case in range(256):
+        follow = {}
+        for corners in _faces():
+            behind = [case >> o & 1 for o in corners]
+            for k in range(4):  # a segment enters where the walk goes behind the surface and leaves where it comes out next
+                if not behind[k] and behind[(k + 1) % 4]:
+                    out = next(j for j in range(k + 1, k + 5) if behind[j % 4] and not behind[(j + 1) % 4])
+                    follow[edge_of[frozenset((corners[k], corners[(k + 1) % 4]))]] = edge_of[
+                        frozenset((corners[out % 4], corners[(out + 1) % 4]))]
+        triangles = []
+        while follow:
+            loop = [next(iter(follow))]
+            while (after := follow.pop(loop[-1])) != loop[0]:
+                loop.append(after)
+            triangles += [(loop[0], loop[k], loop[k + 1]) for k in range(1, len(loop) - 1)]
+        counts[case] = len(triangles)
+        flat = [e for triangle in triangles for e in triangle]
+        flags[case] = sum(1 << e for e in set(flat))
+        table[case, :len(flat)] = flat
+    return counts, flags, table, np.array([[*STEPS[o], d] for o, d in edges], np.int32)
+
+
+def _faces() -> list[list[int]]:
+    """The cell's six faces as corner cycles, counter-clockwise seen from outside."""
+    faces = []
+    for d in range(3):
+        u, v = (d + 1) % 3, (d + 2) % 3
+        square = [sum(4 >> a for a, on in ((u, i), (v, j)) if on) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        faces += [[o + (4 >> d) for o in square], square[::-1]]
+    return faces

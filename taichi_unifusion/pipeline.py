@@ -1,0 +1,125 @@
+"""Pipeline: posed frames -> surface LIM and colour LIM -> coloured mesh (Fig. 7, left)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from . import runtime
+from .config import Config
+from .errors import PoseError, UniFusionError
+from .loading import load_ahead
+from .maps import PropertyMap, SurfaceMap
+from .preprocessing import PreprocessSettings, preprocess
+from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult, name_of
+from .types import Frame, Mesh
+
+
+class Pipeline:
+    """Fuses frames into a surface map and a colour map.
+
+        pipeline = Pipeline(Config())
+        pipeline.run(open_dataset("7scenes", path)[::10])
+        pipeline.extract_mesh().save("kitchen.ply")
+    """
+
+    def __init__(self, config: Config | None = None) -> None:
+        self.config = config or Config()
+        runtime.init(self.config.device, threads=self.config.threads or None)
+        self.surface = SurfaceMap(self.config.surface)
+        self.properties = {"color": PropertyMap("color", 3, self.config.color)}
+
+    @property
+    def maps(self) -> dict[str, SurfaceMap | PropertyMap]:
+        """All maps by name, the surface first."""
+        return {"surface": self.surface, **self.properties}
+
+    def step(self, frame: Frame) -> StepResult:
+        """Fuse one frame; a property that the frame lacks is left out.
+
+        Raises FrameError where the frame has no pose or no usable depth, OutOfRange where it lies beyond a map's index range,
+        CapacityError where a map would grow beyond safe memory.
+        """
+        clock = StageClock()
+        if frame.T_world_camera is None:
+            raise PoseError(f"{name_of(frame)}: there is no pose for this frame")
+        with clock.stage("preprocess"):
+            cloud = preprocess(frame, self.config.preprocess)
+        if len(cloud) == 0:
+            raise EmptyFrame(f"{name_of(frame)}: {_why_empty(frame, self.config.preprocess)}")
+        with clock.stage("transform"):
+            cloud = cloud.transformed(frame.T_world_camera)
+        integrations = {}
+        for name, target in self.maps.items():
+            if target is self.surface or name in cloud.attributes:
+                with clock.stage(name):
+                    integrations[name] = target.integrate(cloud)
+        return StepResult(frame.index, frame.name, len(cloud), integrations, clock.milliseconds)
+
+    def run(self, sequence: Sequence[Frame], *, strict: bool = False, stop: Callable[[], bool] = lambda: False,
+            on_frame: Callable[[int, int], None] = lambda done, total: None) -> RunResult:
+        """Fuse a sequence in order, skipping frames that cannot be used; `strict` ends the run at the first of them.
+
+        `stop` is asked before every frame, `on_frame` told after it. What ends a run early is in the result, with all that was
+        done until then; raises DatasetError only where not one frame could be used.
+        """
+        log, failure, interrupted = RunLog(sequence), None, False
+        for i, load in enumerate(load_ahead(sequence)):
+            if interrupted := stop():
+                break
+            waiting = time.perf_counter()
+            try:
+                frame = load()
+                waited = time.perf_counter() - waiting
+                log.check_depth_scale(frame)
+                log.add_step(frame, self.step(frame), waited)
+            except tuple(SKIP_REASONS) as error:
+                log.add_skipped(i, error)
+                failure = error if strict else None
+            except UniFusionError as error:
+                failure = error
+            on_frame(i + 1, len(sequence))
+            if failure:
+                break
+        return log.result(interrupted, failure)
+
+    def extract_mesh(self, resolution: int | None = None) -> Mesh:
+        """The mesh of all that was fused so far, coloured; `resolution` overrides the configuration's."""
+        return extract_mesh(self.surface, self.properties, resolution or self.config.mesh.resolution)
+
+
+def extract_mesh(surface: SurfaceMap, properties: Mapping[str, PropertyMap], resolution: int) -> Mesh:
+    """The surface as a mesh that carries every property that has data."""
+    mesh = surface.extract_mesh(resolution)
+    for name, field_ in properties.items():
+        if len(field_) and len(mesh.vertices):
+            mesh = mesh.with_attribute(name, field_.query(mesh.vertices))
+    return mesh
+
+
+@dataclass
+class StageClock:
+    """Milliseconds by stage, with the device's work included."""
+
+    milliseconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        runtime.synchronize()
+        self.milliseconds[name] = 1e3 * (time.perf_counter() - start)
+
+
+def _why_empty(frame: Frame, settings: PreprocessSettings) -> str:
+    readings = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
+    if not len(readings):
+        return "the depth image holds no reading at all"
+    if not ((readings >= settings.depth_min) & (readings <= settings.depth_max)).any():
+        return (f"all depth readings lie outside {settings.depth_min:g}..{settings.depth_max:g} m "
+                f"(median {np.median(readings):.3g} m); see preprocess.depth_min and depth_max")
+    return f"all {len(readings)} depth readings lie on edges, on grazing surfaces or too far apart"

@@ -1,0 +1,82 @@
+"""Frame -> PointCloud: readings in range, no flying pixels, normals towards the camera (Sec. IV-B, V-A)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import runtime
+from .errors import InputError
+from .types import Frame, PointCloud
+
+
+@dataclass(frozen=True)
+class PreprocessSettings:
+    """What makes a pixel a point."""
+
+    depth_min: float = 0.1
+    """Nearest reading that is used, in metres."""
+    depth_max: float = 5.0
+    """Farthest reading that is used, in metres."""
+    edge_jump: float = 0.03
+    """Neighbouring pixels whose depths differ by more than this share of the depth lie on different surfaces."""
+    edge_support: int = 5
+    """How many of a pixel's 8 neighbours must lie on its surface; fewer: a flying pixel. 0 keeps all."""
+    normal_radius: int = 3
+    """Radius in pixels of the window from which a normal is estimated."""
+    max_angle: float = 80.0
+    """Pixels seen at a more grazing angle than this, in degrees between ray and normal, are left out."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.depth_min < self.depth_max:
+            raise InputError(f"preprocess: need 0 < depth_min < depth_max, got {self.depth_min} and {self.depth_max}")
+        if not 0 < self.edge_jump < 1 or not 0 <= self.edge_support <= 8:
+            raise InputError(f"preprocess: need 0 < edge_jump < 1 and edge_support in 0..8, got {self.edge_jump} and {self.edge_support}")
+        if not 1 <= self.normal_radius <= 20 or not 0 < self.max_angle <= 90:
+            raise InputError(f"preprocess: need normal_radius in 1..20 and max_angle in (0, 90], got {self.normal_radius} "
+                             f"and {self.max_angle}")
+
+
+def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> PointCloud:
+    """Points, normals, colour and property images of a frame's usable pixels, in camera coordinates, row by row.
+
+    A frame without a usable pixel gives an empty cloud.
+    """
+    runtime.current()
+    from .kernels import images as kernels
+
+    settings = settings or PreprocessSettings()
+    camera = frame.camera
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    raw = np.ascontiguousarray(frame.depth)
+    depth, normals = np.empty_like(raw), np.empty((*raw.shape, 3), np.float32)
+    kernels.clip_depth(raw, settings.depth_min, settings.depth_max, depth)
+    if settings.edge_support:
+        clipped, depth = depth, np.empty_like(raw)
+        kernels.drop_flying_pixels(clipped, settings.edge_jump, settings.edge_support, depth)
+    kernels.estimate_normals(depth, *intrinsics, settings.normal_radius, settings.edge_jump,
+                             float(np.cos(np.radians(settings.max_angle))), normals)
+
+    counts = np.empty(-(-raw.size // kernels.PIXEL_CHUNK), np.int32)
+    kernels.count_points(depth, normals, counts)
+    runtime.synchronize()
+    total = int(counts.sum())
+    points, point_normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)
+    if total == 0:
+        return PointCloud(points, point_normals, {name: np.empty((0, c), np.float32) for name, c in _channels(frame).items()})
+    pixels = np.empty((total, 2), np.int32)
+    kernels.unproject(depth, normals, *intrinsics, (np.cumsum(counts) - counts).astype(np.int32), points, point_normals, pixels)
+    attributes = {name: np.empty((total, c), np.float32) for name, c in _channels(frame).items()}
+    for name, values in attributes.items():
+        if name == "color" and name not in frame.images:
+            kernels.sample_color(pixels, np.ascontiguousarray(frame.color), values)
+        else:
+            kernels.sample_image(pixels, np.ascontiguousarray(frame.images[name]), values)
+    return PointCloud(points, point_normals, attributes)
+
+
+def _channels(frame: Frame) -> dict[str, int]:
+    """Channels of every attribute that the cloud of a frame gets."""
+    channels = {name: image.shape[2] for name, image in frame.images.items()}
+    return channels if frame.color is None else {"color": 3, **channels}

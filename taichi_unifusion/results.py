@@ -1,0 +1,169 @@
+"""The results folder: maps, mesh, preview, trajectory, configuration and metrics of a run, each written atomically."""
+
+from __future__ import annotations
+
+import json
+import logging
+import platform
+import resource
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import mean, median
+from typing import Any
+
+import numpy as np
+
+from . import __version__, runtime
+from .config import dump_config
+from .errors import FileError, InputError
+from .io import atomic_write, check_writable, write_mesh, write_trajectory
+from .pipeline import Pipeline
+from .preview import render_preview
+from .run_log import RunResult, StepResult
+from .types import Mesh
+
+logger = logging.getLogger(__name__)
+
+MESH_FILES = ("mesh.ply", "mesh.glb", "mesh.obj")
+
+
+@dataclass
+class ResultsFolder:
+    """Writes files into a folder; one that fails is remembered, and the others are still written."""
+
+    directory: Path
+    files: list[str] = field(default_factory=list)            # written, relative to the folder
+    failures: list[Exception] = field(default_factory=list)
+
+    def write(self, name: str, write: Callable[[Path], Any]) -> None:
+        """Call `write` with the path of file `name`."""
+        if self.attempt(f"{self.directory / name}: could not be written", lambda: write(self.directory / name) or True):
+            self.files.append(name)
+
+    def attempt(self, what: str, action: Callable[[], Any]) -> Any:
+        """The result of `action`, or None where it failed."""
+        try:
+            return action()
+        except (FileError, InputError) as error:  # these name the file themselves
+            self.failures.append(error)
+        except Exception as error:  # whatever it is, it must not cost the other files
+            logger.debug("%s", what, exc_info=True)
+            self.failures.append(FileError(f"{what} ({type(error).__name__}: {error})"))
+        return None
+
+    def remove(self, name: str) -> None:
+        """Remove a file of an earlier run that this run does not replace, so that results do not mix."""
+        self.attempt(f"{self.directory / name}: could not be removed", lambda: (self.directory / name).unlink(missing_ok=True))
+
+
+@dataclass(frozen=True)
+class Results:
+    """What was written of a run."""
+
+    directory: Path
+    files: tuple[str, ...]             # relative to the directory
+    failures: tuple[Exception, ...]    # one for every file that could not be written
+    metrics: Mapping[str, Any]
+
+
+def prepare_results(directory: str | Path) -> Path:
+    """Make the folder; raises FileError if results cannot be written there, before any work is spent on them."""
+    directory = check_writable(directory)
+    check_writable(directory / "maps")
+    return directory
+
+
+def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, about: Mapping[str, Any] | None = None) -> Results:
+    """Write everything that a run gave, the maps first; `about` joins the metrics (which recording, which frames)."""
+    folder, started = ResultsFolder(prepare_results(directory)), time.perf_counter()
+    logger.info("writing to %s", folder.directory)
+    for name, saved in pipeline.maps.items():
+        folder.write(f"maps/{name}.safetensors", saved.save)
+    folder.write("trajectory.txt", lambda path: write_trajectory(path, run.trajectory))
+    folder.write("config.yaml", lambda path: _write_text(path, dump_config(pipeline.config)))
+    logger.info("extracting the mesh")
+    extracting = time.perf_counter()
+    mesh = folder.attempt(f"{folder.directory}: the mesh could not be extracted", pipeline.extract_mesh)
+    extracted = time.perf_counter()
+    if mesh is not None:
+        _write_mesh_files(folder, mesh, pipeline, run)
+    seconds = {"frames": run.seconds, "mesh": extracted - extracting,
+               "write": time.perf_counter() - started - (extracted - extracting)}
+    metrics = {**(about or {}), **_metrics(folder, pipeline, run, mesh, seconds)}
+    folder.write("metrics.json", lambda path: _write_text(path, json.dumps(metrics, indent=2) + "\n"))
+    return Results(folder.directory, tuple(folder.files), tuple(folder.failures), metrics)
+
+
+def _write_mesh_files(folder: ResultsFolder, mesh: Mesh, pipeline: Pipeline, run: RunResult) -> None:
+    wanted = {f"mesh.{suffix}" for suffix in pipeline.config.mesh.formats}
+    if not len(mesh.faces):
+        folder.failures.append(InputError(
+            f"the mesh is empty: {len(run.steps)} frames gave no surface; look at preprocess.depth_max, surface.min_points and "
+            "surface.support_points, or use more frames"))
+        wanted &= {"mesh.ply"}  # the other formats cannot say that there is nothing
+    for name in MESH_FILES:
+        if name in wanted:
+            folder.write(name, lambda path: write_mesh(path, mesh))
+        else:
+            folder.remove(name)
+    if len(mesh.faces):
+        folder.write("preview.png", lambda path: render_preview(mesh, path, trajectory=run.trajectory))
+    else:
+        folder.remove("preview.png")
+
+
+def _metrics(folder: ResultsFolder, pipeline: Pipeline, run: RunResult, mesh: Mesh | None,
+             seconds: Mapping[str, float]) -> dict[str, Any]:
+    """What `metrics.json` holds; JSON values only."""
+    reasons = Counter(frame.reason for frame in run.skipped)
+    first = {frame.reason: frame.message for frame in reversed(run.skipped)}
+    device = runtime.current()
+    return {
+        "device": device.device,
+        "device_name": device.description,
+        "frames": {
+            "used": len(run.steps), "skipped": len(run.skipped), "interrupted": run.interrupted,
+            "reasons": [{"reason": reason, "frames": count, "first": first[reason]} for reason, count in reasons.most_common()],
+            "skipped_frames": [{"frame": frame.index, "message": frame.message} for frame in run.skipped],
+        },
+        "milliseconds": stage_milliseconds(run.steps),
+        "seconds": {name: round(value, 3) for name, value in seconds.items()},
+        "points": {"median": median(step.points for step in run.steps), "total": sum(step.points for step in run.steps)},
+        "maps": {name: {"voxel_size": target.voxel_size, "voxels": len(target), "bytes": target.memory_bytes,
+                        "file_bytes": _size(folder.directory / "maps" / f"{name}.safetensors")}
+                 for name, target in pipeline.maps.items()},
+        "mesh": None if mesh is None else {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)},
+        "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,  # Linux counts KiB
+        "files": {name: _size(folder.directory / name) for name in folder.files},
+        "warnings": list(run.warnings),
+        "errors": [str(error) for error in (run.failure, *folder.failures) if error is not None],
+        "versions": versions(),
+    }
+
+
+def stage_milliseconds(steps: tuple[StepResult, ...]) -> dict[str, dict[str, float]]:
+    """Median and mean of every stage over the frames that had it, and of whole frames; the first frame's start-up included."""
+    stages = list(dict.fromkeys(stage for step in steps for stage in step.milliseconds))
+    samples = {stage: [step.milliseconds[stage] for step in steps if stage in step.milliseconds] for stage in stages}
+    samples["frame"] = [sum(step.milliseconds.values()) for step in steps]
+    return {stage: {"median": round(median(values), 2), "mean": round(mean(values), 2)} for stage, values in samples.items()}
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of what its numbers depend on."""
+    import taichi as ti
+
+    return {"taichi_unifusion": __version__, "python": platform.python_version(), "taichi": ".".join(map(str, ti.__version__)),
+            "numpy": np.__version__, "platform": platform.platform()}
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0

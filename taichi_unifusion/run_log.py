@@ -1,0 +1,130 @@
+"""What a run did, frame by frame, as values; and the log that collects them while it runs."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .datasets.checks import guess_depth_scale
+from .errors import DatasetError, FrameError, OutOfRange, PoseError, SizeMismatch, UniFusionError
+from .loading import index_in_recording, recording_of
+from .maps import Integration
+from .types import Frame, Trajectory
+
+logger = logging.getLogger(__name__)
+
+
+class EmptyFrame(FrameError):
+    """No depth reading of a frame can be used."""
+
+
+SKIP_REASONS: dict[type[UniFusionError], str] = {  # the first class that fits names the kind
+    PoseError: "no usable pose",
+    SizeMismatch: "image sizes differ",
+    EmptyFrame: "no usable depth",
+    FrameError: "unreadable image",
+    OutOfRange: "outside the range of the map",
+}
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one frame did."""
+
+    index: int                                # place in its recording
+    name: str
+    points: int                               # after preprocessing
+    integrations: Mapping[str, Integration]   # by map
+    milliseconds: Mapping[str, float]         # by stage
+
+
+@dataclass(frozen=True)
+class SkippedFrame:
+    """A frame that was not used, and why."""
+
+    index: int    # place in its recording
+    reason: str   # its kind, one of SKIP_REASONS
+    message: str
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run did; the maps are the pipeline's."""
+
+    steps: tuple[StepResult, ...]
+    skipped: tuple[SkippedFrame, ...]
+    trajectory: Trajectory                 # of the frames used
+    warnings: tuple[str, ...]
+    seconds: float
+    interrupted: bool = False              # asked to stop before the last frame
+    failure: UniFusionError | None = None  # what else ended the run before the last frame
+
+
+class RunLog:
+    """Collects what becomes a RunResult; says the first of every kind of trouble at once."""
+
+    def __init__(self, sequence: Sequence[Frame]) -> None:
+        self.sequence, self.name = sequence, getattr(sequence, "name", "sequence")
+        self.started = time.perf_counter()
+        self.steps: list[StepResult] = []
+        self.skipped: list[SkippedFrame] = []
+        self.reasons: Counter[str] = Counter()
+        self.poses: list[tuple[float | None, np.ndarray]] = []  # time stamp, T_world_camera
+        self.warnings: list[str] = []
+        self.scale_checked = self.color_missing = False
+        for sentence in getattr(sequence, "warnings", ()):
+            self.warn(sentence)
+
+    def warn(self, sentence: str) -> None:
+        self.warnings.append(sentence)
+        logger.warning("%s", sentence)
+
+    def check_depth_scale(self, frame: Frame) -> None:
+        """Warn if the first frame with readings looks as if the depth scale were wrong."""
+        scale = getattr(recording_of(self.sequence), "depth_scale", None)
+        if self.scale_checked or scale is None:
+            return
+        self.scale_checked = bool((frame.depth > 0).any())
+        if guess := guess_depth_scale(frame.depth, scale):
+            self.warn(f"{name_of(frame)}: {guess}")
+
+    def add_step(self, frame: Frame, step: StepResult, waited: float) -> None:
+        if frame.color is None and not self.color_missing:
+            self.color_missing = True
+            self.warn(f"{name_of(frame)}: there is no colour image; frames without one add to the surface only")
+        self.steps.append(replace(step, milliseconds={"load": 1e3 * waited, **step.milliseconds}))
+        self.poses.append((frame.timestamp, frame.T_world_camera))
+
+    def add_skipped(self, i: int, error: UniFusionError) -> None:
+        reason = next(reason for kind, reason in SKIP_REASONS.items() if isinstance(error, kind))
+        if reason not in self.reasons:
+            self.warn(f"frame skipped, {reason}: {error}")
+        self.reasons[reason] += 1
+        self.skipped.append(SkippedFrame(index_in_recording(self.sequence, i), reason, str(error)))
+
+    def result(self, interrupted: bool, failure: UniFusionError | None) -> RunResult:
+        if not self.steps and not interrupted:
+            raise failure or DatasetError(self._nothing_used())
+        stamps = [stamp for stamp, _ in self.poses]
+        if None in stamps:  # no time stamps in this format: TUM's file format gets the frame numbers
+            stamps = [step.index for step in self.steps]
+        trajectory = Trajectory(np.array(stamps, np.float64), np.array([T for _, T in self.poses]).reshape(-1, 4, 4))
+        return RunResult(tuple(self.steps), tuple(self.skipped), trajectory, tuple(self.warnings),
+                         time.perf_counter() - self.started, interrupted, failure)
+
+    def _nothing_used(self) -> str:
+        if not self.skipped:
+            return f"{self.name}: there are no frames to use"
+        reason, count = self.reasons.most_common(1)[0]
+        first = next(frame.message for frame in self.skipped if frame.reason == reason)
+        return f"{self.name}: none of {len(self.skipped)} frames could be used, {count} for '{reason}' (first: {first})"
+
+
+def name_of(frame: Frame) -> str:
+    """The frame in messages."""
+    return frame.name or f"frame {frame.index}"

@@ -1,0 +1,92 @@
+"""The one place that starts Taichi: chooses CUDA or the CPU, says which, and remembers it.
+
+`ti.init` is global to the process, and a second one frees every field of the first: maps remember the runtime that they
+were made under (`current()`) and refuse to go on under another.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+from dataclasses import dataclass, field
+
+from .errors import CapacityError, InputError, RuntimeStateError
+
+logger = logging.getLogger(__name__)
+
+DEVICES = ("auto", "cuda", "cpu")
+MAX_TREES = 12  # each reserves some 80 MB of a pool that fails silently somewhat above 1.6 GB
+
+
+@dataclass(frozen=True, eq=False)
+class Runtime:
+    """A started Taichi: `device` is "cuda" or "cpu", `description` names it for people."""
+
+    device: str
+    description: str
+    free_trees: list = field(default_factory=list, repr=False)  # index trees of maps that are gone: Taichi cannot free them
+    trees: list = field(default_factory=lambda: [0], repr=False)
+
+    def count_tree(self) -> None:
+        """Note that one more index tree is made; raises CapacityError before there are more than Taichi bears."""
+        if self.trees[0] >= MAX_TREES:
+            raise CapacityError(f"more than {MAX_TREES} maps live at once: delete or save some, or use another process")
+        self.trees[0] += 1
+
+
+_runtime: Runtime | None = None
+
+
+def init(device: str = "auto", *, threads: int | None = None, device_memory_gb: float = 2.0, debug: bool = False) -> Runtime:
+    """Start Taichi on CUDA if there is one, else on the CPU, and say which; a second call with the same device does nothing.
+
+    `threads` caps the CPU threads, `device_memory_gb` is CUDA's fixed pool for sparse voxels, `debug` checks array bounds.
+    Raises InputError for an unknown device, RuntimeStateError where CUDA is asked for and absent, or another device is live.
+    """
+    global _runtime
+    if device not in DEVICES:
+        raise InputError(f"device: '{device}' is unknown, choose one of {', '.join(DEVICES)}")
+    if _runtime is not None:
+        if device in ("auto", _runtime.device):
+            return _runtime
+        raise RuntimeStateError(f"device: Taichi already runs on {_runtime.device}; start a new process to use {device}")
+    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+    import taichi as ti
+
+    options = dict(log_level=ti.ERROR, offline_cache=True, debug=debug, default_fp=ti.f32, default_ip=ti.i32)
+    if threads:
+        options["cpu_max_num_threads"] = threads
+    wanted = ti.cpu if device == "cpu" else ti.cuda  # never ti.gpu: Vulkan has no pointer SNodes
+    ti.init(arch=wanted, device_memory_GB=device_memory_gb, **options)
+    found = "cuda" if ti.lang.impl.current_cfg().arch == ti.cuda else "cpu"
+    if device == "cuda" and found != "cuda":
+        raise RuntimeStateError("device: CUDA was asked for but Taichi finds none; use device 'cpu' or check the NVIDIA driver")
+    _runtime = Runtime(found, _describe(found, threads))
+    logger.info("Taichi %s on %s", ".".join(map(str, ti.__version__)), _runtime.description)
+    return _runtime
+
+
+def current() -> Runtime:
+    """The live runtime; starts one with the defaults if there is none."""
+    return _runtime or init()
+
+
+def check_alive(runtime: Runtime) -> None:
+    """Raise RuntimeStateError unless `runtime` is the live one."""
+    if runtime is not _runtime:
+        raise RuntimeStateError("this map was made before Taichi was started again and its memory is gone; save maps first, "
+                                "then load them in the new process")
+
+
+def synchronize() -> None:
+    """Wait until the device has finished, so that a clock tells the truth."""
+    import taichi as ti
+
+    ti.sync()
+
+
+def _describe(device: str, threads: int | None) -> str:
+    if device == "cuda":
+        return "CUDA GPU"
+    return f"CPU ({platform.processor() or platform.machine()}, {threads or os.cpu_count()} threads)"

@@ -1,0 +1,134 @@
+"""What a person sees of a command: messages, a progress bar where stderr is a screen, and tables in plain text."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+LINE_INTERVAL = 10.0  # [s] between progress lines where there is no bar
+
+logger = logging.getLogger("taichi_unifusion")
+
+
+class StderrHandler(logging.Handler):
+    """Log records as lines on stderr, above the bar if there is one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.write_above_bar: Callable[[str], None] | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        label = {logging.WARNING: "warning: ", logging.ERROR: "error: "}.get(record.levelno, "")
+        text = f"unifusion: {label}{record.getMessage()}"
+        if record.exc_info:
+            text += "\n" + logging.Formatter().formatException(record.exc_info)
+        if self.write_above_bar:
+            self.write_above_bar(text)
+        else:
+            sys.stderr.write(text + "\n")
+            sys.stderr.flush()
+
+
+@contextmanager
+def log_to_stderr(debug: bool = False) -> Iterator[None]:
+    """Show what the package logs while the block runs."""
+    handler, level = StderrHandler(), logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG if debug else logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+
+
+@contextmanager
+def frame_progress(total: int) -> Iterator[Callable[[int, int], None]]:
+    """Gives a function to call with (frames done, frames in all): a bar with rate and time left, or now and then a line."""
+    if not sys.stderr.isatty():
+        yield _progress_lines()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+    columns = (SpinnerColumn(), TextColumn("frames"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
+               TimeRemainingColumn(), TextColumn("left"))
+    with Progress(*columns, console=Console(stderr=True)) as bar, _above(bar):
+        task = bar.add_task("frames", total=total, rate="")
+
+        def update(done: int, total: int) -> None:
+            speed = bar.tasks[0].speed
+            bar.update(task, completed=done, rate=f"{speed:.1f} frames/s" if speed else "")
+
+        yield update
+
+
+@contextmanager
+def _above(bar: Any) -> Iterator[None]:
+    """Let the log write above a rich bar."""
+    handlers = [handler for handler in logger.handlers if isinstance(handler, StderrHandler)]
+    for handler in handlers:
+        handler.write_above_bar = lambda text: bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            handler.write_above_bar = None
+
+
+def _progress_lines() -> Callable[[int, int], None]:
+    first, last = None, -LINE_INTERVAL
+
+    def update(done: int, total: int) -> None:
+        nonlocal first, last
+        now = time.perf_counter()
+        first = first or (now, done)  # the first frame includes the compiler's start
+        if now - last < LINE_INTERVAL and done < total:
+            return
+        last, rate = now, (done - first[1]) / (now - first[0]) if now > first[0] else 0.0
+        left = f", {rate:.1f} frames/s, {(total - done) / rate:.0f} s left" if rate and done < total else ""
+        logger.info("frame %d of %d%s", done, total, left)
+
+    return update
+
+
+def format_table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as aligned columns; cells that are numbers go to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    numeric = [all(cell[:1].isdigit() for cell in column[1:]) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(cell.rjust(width) if right else cell.ljust(width)
+                               for cell, width, right in zip(row, widths, numeric, strict=True)).rstrip() for row in rows)
+
+
+def format_bytes(count: float) -> str:
+    """A size as people write it, in powers of 1000."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.2f} GB"
+
+
+def summarize(metrics: Mapping[str, Any], files: Sequence[str], directory: Path) -> str:
+    """The end of a run in some lines: its metrics, and the files that it wrote."""
+    frames, seconds, mesh = metrics["frames"], metrics["seconds"], metrics["mesh"]
+    stages = [["stage", "median ms", "mean ms"]]
+    stages += [[stage, f"{value['median']:.1f}", f"{value['mean']:.1f}"] for stage, value in metrics["milliseconds"].items()]
+    maps = [["map", "voxels", "voxel size", "memory"]]
+    maps += [[name, f"{value['voxels']:,}", f"{100 * value['voxel_size']:g} cm", format_bytes(value["bytes"])]
+             for name, value in metrics["maps"].items()]
+    lines = [f"frames   {frames['used']} used, {frames['skipped']} skipped{', stopped early' if frames['interrupted'] else ''}"]
+    lines += [f"           {entry['frames']} {entry['reason']} (first: {entry['first']})" for entry in frames["reasons"]]
+    lines += ["", format_table(stages), "", format_table(maps), ""]
+    if mesh:
+        lines.append(f"mesh     {mesh['vertices']:,} vertices, {mesh['triangles']:,} triangles")
+    lines += [f"time     {seconds['frames']:.1f} s for the frames, {seconds['mesh']:.1f} s for the mesh, "
+              f"{seconds['write']:.1f} s to write",
+              f"memory   {format_bytes(metrics['peak_memory_bytes'])} at most, on {metrics['device_name']}",
+              f"results  {directory}: {', '.join(files)}"]
+    return "\n".join(lines)

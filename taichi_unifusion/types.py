@@ -1,0 +1,198 @@
+"""Values that travel through the pipeline: frozen, checked once at the door.
+
+Frames of reference: *camera* is x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a. Metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import FrameError, InputError, PoseError, SizeMismatch
+
+RIGID_TOLERANCE = 1e-3  # |R^T R - I| and |det R - 1|: text files of 6 digits pass, a scale of 0.1 % does not
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Pinhole intrinsics without distortion: u = fx x / z + cx, v = fy y / z + cy, pixel centres at integers."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if not all(np.isfinite(numbers)) or self.fx <= 0 or self.fy <= 0:
+            raise InputError(f"camera: fx, fy must be positive and all intrinsics finite, got fx={self.fx} fy={self.fy} "
+                             f"cx={self.cx} cy={self.cy}")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"camera: image size must be positive, got {self.width}x{self.height}")
+        if not (0 <= self.cx <= self.width and 0 <= self.cy <= self.height):
+            raise InputError(f"camera: principal point ({self.cx}, {self.cy}) lies outside the {self.width}x{self.height} image; "
+                             "are these the intrinsics of another resolution?")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self.width, self.height
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The 3x3 matrix K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def resized(self, width: int, height: int) -> PinholeCamera:
+        """The same camera for the image resampled to width x height (pixel centres at integers)."""
+        sx, sy = width / self.width, height / self.height
+        return PinholeCamera(width, height, self.fx * sx, self.fy * sy,
+                             (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
+
+
+def check_rigid(T: NDArray, name: str = "T_world_camera") -> NDArray[np.float64]:
+    """Return T as a (4, 4) float64 rigid transform, or raise PoseError with the numbers that are off."""
+    T = np.asarray(T, dtype=np.float64)
+    if T.shape != (4, 4):
+        raise PoseError(f"{name}: expected a 4x4 matrix, got shape {T.shape}")
+    if not np.isfinite(T).all():
+        raise PoseError(f"{name}: holds NaN or infinite numbers")
+    if not np.allclose(T[3], (0, 0, 0, 1), atol=1e-6):
+        raise PoseError(f"{name}: last row is {T[3].tolist()}, not 0 0 0 1; is the matrix transposed?")
+    R = T[:3, :3]
+    det, skew = float(np.linalg.det(R)), float(np.abs(R.T @ R - np.eye(3)).max())
+    if abs(det - 1) > RIGID_TOLERANCE or skew > RIGID_TOLERANCE:
+        raise PoseError(f"{name}: not a rotation (det R = {det:.4f}, max |R^T R - I| = {skew:.4f}; "
+                        f"both must be within {RIGID_TOLERANCE} of 1 and 0)")
+    return T
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One RGB-D image with its camera and, if known, its pose."""
+
+    depth: NDArray[np.float32]                            # (H, W) [m]; 0, negative, NaN, inf: no reading
+    camera: PinholeCamera                                 # of the depth image
+    color: NDArray[np.uint8] | None = None                # (H, W, 3) RGB
+    T_world_camera: NDArray[np.float64] | None = None     # (4, 4)
+    index: int = 0                                        # place in its sequence
+    timestamp: float | None = None                        # [s]
+    name: str = ""                                        # where it came from, for messages
+    images: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)  # property images, (H, W, c)
+
+    def __post_init__(self) -> None:
+        at = f"frame {self.name or self.index}"
+        if self.depth.ndim != 2 or self.depth.dtype != np.float32:
+            raise FrameError(f"{at}: depth must be (H, W) float32 in metres, got {self.depth.shape} {self.depth.dtype}")
+        height, width = self.depth.shape
+        if (width, height) != self.camera.size:
+            raise SizeMismatch(f"{at}: depth is {width}x{height} but the camera is {self.camera.width}x{self.camera.height}")
+        if self.color is not None:
+            if self.color.ndim != 3 or self.color.shape[2] != 3 or self.color.dtype != np.uint8:
+                raise FrameError(f"{at}: color must be (H, W, 3) uint8 RGB, got {self.color.shape} {self.color.dtype}")
+            self._check_size(at, "color", self.color)
+        for name, image in self.images.items():
+            if image.ndim != 3 or image.dtype != np.float32:
+                raise FrameError(f"{at}: image '{name}' must be (H, W, c) float32, got {image.shape} {image.dtype}")
+            self._check_size(at, f"image '{name}'", image)
+        if self.T_world_camera is not None:
+            object.__setattr__(self, "T_world_camera", check_rigid(self.T_world_camera, f"{at}: T_world_camera"))
+
+    def _check_size(self, at: str, what: str, image: NDArray) -> None:
+        if image.shape[:2] != self.depth.shape:
+            raise SizeMismatch(f"{at}: {what} is {image.shape[1]}x{image.shape[0]} but depth is "
+                               f"{self.depth.shape[1]}x{self.depth.shape[0]}; register or resize one of them")
+
+    def with_image(self, name: str, image: NDArray) -> Frame:
+        """A copy that also carries the property image `name`, (H, W) or (H, W, c)."""
+        image = np.ascontiguousarray(image, dtype=np.float32)
+        return replace(self, images={**self.images, name: image[..., None] if image.ndim == 2 else image})
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points with unit normals towards the camera and any sampled properties, all in one frame of reference."""
+
+    points: NDArray[np.float32]                # (N, 3) [m]
+    normals: NDArray[np.float32] | None = None  # (N, 3) unit, towards the camera
+    attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)  # name -> (N, c); "color" is RGB in [0, 1]
+
+    def __post_init__(self) -> None:
+        for name, array, columns in (("points", self.points, 3), ("normals", self.normals, 3),
+                                     *((f"attribute '{k}'", v, None) for k, v in self.attributes.items())):
+            if array is None:
+                continue
+            if array.ndim != 2 or (columns and array.shape[1] != columns) or array.dtype != np.float32:
+                raise InputError(f"point cloud: {name} must be (N, {columns or 'c'}) float32, got {array.shape} {array.dtype}")
+            if len(array) != len(self.points):
+                raise InputError(f"point cloud: {len(self.points)} points but {len(array)} rows of {name}")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def transformed(self, T_b_a: NDArray) -> PointCloud:
+        """This cloud, given in frame a, in frame b."""
+        from . import runtime
+
+        runtime.current()
+        from .kernels.images import transform  # Taichi starts with the first kernel, not with the first type
+
+        T = check_rigid(T_b_a, "T_b_a").astype(np.float32)
+        rotation = np.hstack([T[:3, :3], np.zeros((3, 1), np.float32)])
+        moved = []
+        for vectors, matrix in ((self.points, np.ascontiguousarray(T[:3])), (self.normals, rotation)):
+            moved.append(None if vectors is None else np.empty_like(vectors))
+            if vectors is not None and len(vectors):
+                transform(np.ascontiguousarray(vectors), matrix, moved[-1])
+        return replace(self, points=moved[0], normals=moved[1])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh, welded and indexed."""
+
+    vertices: NDArray[np.float32]               # (V, 3) [m]
+    faces: NDArray[np.int32]                    # (F, 3), counter-clockwise seen from outside (from free space)
+    normals: NDArray[np.float32] | None = None  # (V, 3) unit, into free space
+    attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)  # name -> (V, c); "color" is RGB in [0, 1]
+
+    def __post_init__(self) -> None:
+        if self.vertices.ndim != 2 or self.vertices.shape[1] != 3:
+            raise InputError(f"mesh: vertices must be (V, 3), got {self.vertices.shape}")
+        if self.faces.ndim != 2 or self.faces.shape[1] != 3:
+            raise InputError(f"mesh: faces must be (F, 3), got {self.faces.shape}")
+        for name, array in (("normals", self.normals), *self.attributes.items()):
+            if array is not None and len(array) != len(self.vertices):
+                raise InputError(f"mesh: {len(self.vertices)} vertices but {len(array)} rows of {name}")
+
+    def with_attribute(self, name: str, values: NDArray) -> Mesh:
+        """A copy with `values`, (V,) or (V, c), at the vertices under `name`."""
+        values = np.ascontiguousarray(values, dtype=np.float32)
+        return replace(self, attributes={**self.attributes, name: values[:, None] if values.ndim == 1 else values})
+
+    def save(self, path) -> None:
+        """Write the mesh; the suffix chooses PLY, GLB or OBJ."""
+        from .io import write_mesh
+
+        write_mesh(path, self)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Camera poses in time order."""
+
+    timestamps: NDArray[np.float64]      # (N,) [s]
+    T_world_camera: NDArray[np.float64]  # (N, 4, 4)
+
+    def __post_init__(self) -> None:
+        n = len(self.timestamps)
+        if self.timestamps.shape != (n,) or self.T_world_camera.shape != (n, 4, 4):
+            raise InputError(f"trajectory: expected (N,) and (N, 4, 4), got {self.timestamps.shape} and {self.T_world_camera.shape}")
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
