@@ -23,7 +23,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
 from . import __version__
 from .config import Config, dump_config, load_config
-from .datasets import FORMATS, open_dataset
+from .datasets import FORMATS, Dataset, open_dataset
 from .errors import DatasetError, FileError, InputError, UniFusionError
 from .interrupts import stop_on_signal
 from .terminal import format_bytes, frame_progress, log_to_stderr, summarize
@@ -123,31 +123,41 @@ def reconstruct(options: Reconstruct) -> int:
     """Frames -> maps -> mesh -> results folder."""
     recording = open_dataset(options.format, options.path, **options.reading)
     frames = _select(recording, options)
-    from .pipeline import Pipeline
-    from .results import prepare_results, write_results
+    from .results import prepare_results, remove_temporaries
 
     directory = prepare_results(options.out)
     with stop_on_signal() as stop:
-        with redirect_stdout(StringIO()):  # Taichi announces itself there
-            pipeline = Pipeline(options.settings)
-        with frame_progress(len(frames)) as on_frame:
-            run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
-        if not run.steps:
-            logger.warning("stopped before the first frame was done; nothing was written")
-            return INTERRUPTED
-        done = len(run.steps) + len(run.skipped)
-        if done < len(frames):
-            logger.warning("%s after %d of %d frames; writing what they gave", "stopped" if run.interrupted else "ended early",
-                           done, len(frames))
-        about = {"format": options.format, "path": str(options.path or ""), "start": options.start, "end": options.end,
-                 "every": options.every, "frames": len(frames)}
-        results = write_results(directory, pipeline, run, {"recording": about})
+        try:
+            return _run_and_write(options, frames, directory, stop)
+        except KeyboardInterrupt:  # the second signal, which may have come in the middle of a clean-up
+            remove_temporaries(directory)
+            raise
+
+
+def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop: Callable[[], bool]) -> int:
+    from .pipeline import Pipeline
+    from .results import write_results
+
+    with redirect_stdout(StringIO()):  # Taichi announces itself there
+        pipeline = Pipeline(options.settings)
+    with frame_progress(len(frames)) as on_frame:
+        run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
+    if not run.steps:
+        logger.warning("stopped before the first frame was done; nothing was written")
+        return INTERRUPTED
+    done = len(run.steps) + len(run.skipped)
+    if done < len(frames):
+        logger.warning("%s after %d of %d frames; writing what they gave", "stopped" if run.interrupted else "ended early",
+                       done, len(frames))
+    about = {"format": options.format, "path": str(options.path or ""), "start": options.start, "end": options.end,
+             "every": options.every, "frames": len(frames)}
+    results = write_results(directory, pipeline, run, {"recording": about})
     print(json.dumps(results.metrics, indent=2) if options.json else summarize(results.metrics, results.files, directory))
-    failed = _report([error for error in (run.failure, *results.failures) if error])
-    return INTERRUPTED if stop() else failed
+    code = _report([error for error in (run.failure, *results.failures) if error])
+    return INTERRUPTED if stop() else code
 
 
-def _select(recording, options: ReconstructOptions):
+def _select(recording: Dataset, options: ReconstructOptions) -> Dataset:
     """The frames asked for, or DatasetError if there are none."""
     if options.start < 0 or options.every < 1 or (options.end is not None and options.end <= options.start):
         raise InputError(f"frames: need 0 <= start < end and every >= 1, got start {options.start}, end {options.end}, "

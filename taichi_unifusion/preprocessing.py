@@ -50,16 +50,14 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
     camera = frame.camera
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     raw = np.ascontiguousarray(frame.depth)
-    depth, normals = np.empty_like(raw), np.empty((*raw.shape, 3), np.float32)
+    depth, inverse, normals = np.empty_like(raw), np.empty_like(raw), np.empty((*raw.shape, 3), np.float32)
     kernels.clip_depth(raw, settings.depth_min, settings.depth_max, depth)
-    if settings.edge_support:
-        clipped, depth = depth, np.empty_like(raw)
-        kernels.drop_flying_pixels(clipped, settings.edge_jump, settings.edge_support, depth)
-    kernels.estimate_normals(depth, *intrinsics, settings.normal_radius, settings.edge_jump,
+    kernels.drop_flying_pixels(depth, settings.edge_jump, settings.edge_support, inverse)
+    kernels.estimate_normals(inverse, *intrinsics, settings.normal_radius, settings.edge_jump,
                              float(np.cos(np.radians(settings.max_angle))), normals)
 
     counts = np.empty(-(-raw.size // kernels.PIXEL_CHUNK), np.int32)
-    kernels.count_points(depth, normals, counts)
+    kernels.count_points(normals, counts)
     runtime.synchronize()
     total = int(counts.sum())
     points, point_normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)

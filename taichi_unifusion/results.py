@@ -9,6 +9,7 @@ import resource
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean, median
@@ -74,6 +75,13 @@ def prepare_results(directory: str | Path) -> Path:
     directory = check_writable(directory)
     check_writable(directory / "maps")
     return directory
+
+
+def remove_temporaries(directory: Path) -> None:
+    """Remove what a write left that was ended at once, in the folders that `prepare_results` made."""
+    for path in (*directory.glob(".*.tmp"), *(directory / "maps").glob(".*.tmp")):
+        with suppress(OSError):
+            path.unlink()
 
 
 def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, about: Mapping[str, Any] | None = None) -> Results:

@@ -32,7 +32,7 @@ def drop_flying_pixels(
     jump: ti.f32,      # pixels whose depths differ by less than this share belong together
     support: ti.i32,   # of its 8 neighbours, so many must belong together with a pixel
     # out:
-    cleaned: Floats2,  # (H, W) [m], 0 also where a pixel hangs between surfaces
+    inverse: Floats2,  # (H, W) [1/m], 0 where there is no reading or a pixel hangs between surfaces
 ):
     height, width = depth.shape[0], depth.shape[1]
     for v, u in depth:
@@ -42,60 +42,58 @@ def drop_flying_pixels(
             for dv, du in ti.static(ti.ndrange((-1, 2), (-1, 2))):
                 if ti.static(dv != 0 or du != 0):
                     close += ti.cast(ti.abs(depth[v + dv, u + du] - z) <= jump * z, ti.i32)
-        cleaned[v, u] = z if close >= support else 0.0
+        inverse[v, u] = 1.0 / z if z > 0 and close >= support else 0.0
 
 
 @ti.func
-def inverse_depth_slope(depth: ti.template(), v: ti.i32, u: ti.i32, radius: ti.i32, jump: ti.f32):
+def inverse_depth_slope(inverse: ti.template(), v: ti.i32, u: ti.i32, radius: ti.template(), jump: ti.f32):
     """Least-squares slopes of 1/z by u and v over a window, from pairs of pixels opposite to (v, u) that belong with it.
 
-    A plane has an inverse depth that is linear in the image. Also returns the fewer of the two counts of pairs.
+    A plane has an inverse depth that is linear in the image. Also returns the smaller sum of squares of the two fits.
     """
-    z = depth[v, u]
-    near, far = 1.0 / (z * (1.0 + jump)), 1.0 / (z * (1.0 - jump))
+    q = inverse[v, u]
+    near = jump * q
     along_u, along_v, square_u, square_v = 0.0, 0.0, 0.0, 0.0
-    height, width = depth.shape[0], depth.shape[1]
-    if v >= radius and u >= radius and v < height - radius and u < width - radius:
+    if v >= radius and u >= radius and v < inverse.shape[0] - radius and u < inverse.shape[1] - radius:
         for i in range(-radius, radius + 1):
-            for k in range(1, radius + 1):
-                right, left = depth[v + i, u + k], depth[v + i, u - k]
-                below, above = depth[v + k, u + i], depth[v - k, u + i]
-                right, left, below, above = 1 / right, 1 / left, 1 / below, 1 / above  # 1/0 is far above `far`
-                if right > near and right < far and left > near and left < far:
-                    along_u += k * (right - left)
-                    square_u += 2 * k * k
-                if below > near and below < far and above > near and above < far:
-                    along_v += k * (below - above)
-                    square_v += 2 * k * k
+            for k in ti.static(range(1, radius + 1)):
+                right, left = inverse[v + i, u + k], inverse[v + i, u - k]
+                below, above = inverse[v + k, u + i], inverse[v - k, u + i]
+                with_u = ti.max(ti.abs(right - q), ti.abs(left - q)) < near
+                with_v = ti.max(ti.abs(below - q), ti.abs(above - q)) < near
+                along_u += ti.select(with_u, k * (right - left), 0.0)
+                square_u += ti.select(with_u, 2.0 * k * k, 0.0)
+                along_v += ti.select(with_v, k * (below - above), 0.0)
+                square_v += ti.select(with_v, 2.0 * k * k, 0.0)
     return along_u / ti.max(square_u, 1.0), along_v / ti.max(square_v, 1.0), ti.min(square_u, square_v)
 
 
 @ti.kernel
 def estimate_normals(
     # in:
-    depth: Floats2,     # (H, W) [m], 0: none
+    inverse: Floats2,   # (H, W) 1/z [1/m], 0: none
     fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32,
-    radius: ti.i32,     # of the window [pixels]
+    radius: ti.template(),  # of the window [pixels]
     jump: ti.f32,
     cos_max_angle: ti.f32,  # between the normal and the ray back to the camera
     # out:
     normals: Floats3,   # (H, W, 3) unit, towards the camera; z component 0 where there is none
 ):
-    height, width = depth.shape[0], depth.shape[1]
+    height, width = inverse.shape[0], inverse.shape[1]
     for v2, u2 in ti.ndrange((height + 1) // 2, (width + 1) // 2):
         slope_u, slope_v, found, of = 0.0, 0.0, 0.0, 0.0
         for part in range(4):  # a quad of pixels shares its slopes where it lies on one surface
             v, u = v2 * 2 + part // 2, u2 * 2 + part % 2
             if v < height and u < width:
-                z = depth[v, u]
+                q = inverse[v, u]
                 n = ti.Vector([0.0, 0.0, 0.0])
-                if z > 0:
-                    if found == 0.0 or ti.abs(z - of) > 0.5 * jump * z:
-                        slope_u, slope_v, found = inverse_depth_slope(depth, v, u, radius, jump)
-                        of = z
+                if q > 0:
+                    if of == 0.0 or ti.abs(q - of) > 0.5 * jump * q:
+                        slope_u, slope_v, found = inverse_depth_slope(inverse, v, u, radius, jump)
+                        of = q
                     if found >= 2 * radius * radius:
                         ray = ti.Vector([(u - cx) / fx, (v - cy) / fy, 1.0])
-                        m = ti.Vector([slope_u * fx, slope_v * fy, 1 / z - slope_u * (u - cx) - slope_v * (v - cy)]) * z
+                        m = ti.Vector([slope_u * fx, slope_v * fy, q - slope_u * (u - cx) - slope_v * (v - cy)]) / q
                         if 1.0 >= cos_max_angle * m.norm() * ray.norm():  # m . ray = 1
                             n = -m.normalized()
                 for d in ti.static(range(3)):
@@ -105,16 +103,15 @@ def estimate_normals(
 @ti.kernel
 def count_points(
     # in:
-    depth: Floats2,    # (H, W)
     normals: Floats3,  # (H, W, 3)
     # out:
-    counts: Ints1,     # (H W / PIXEL_CHUNK,) pixels with a reading and a normal
+    counts: Ints1,     # (H W / PIXEL_CHUNK,) pixels with a normal
 ):
-    width, size = depth.shape[1], depth.shape[0] * depth.shape[1]
+    width, size = normals.shape[1], normals.shape[0] * normals.shape[1]
     for chunk in range(counts.shape[0]):
         count = 0
         for p in range(chunk * PIXEL_CHUNK, ti.min((chunk + 1) * PIXEL_CHUNK, size)):
-            count += ti.cast(depth[p // width, p % width] > 0 and normals[p // width, p % width, 2] != 0, ti.i32)
+            count += ti.cast(normals[p // width, p % width, 2] != 0, ti.i32)
         counts[chunk] = count
 
 
@@ -135,7 +132,7 @@ def unproject(
         for p in range(chunk * PIXEL_CHUNK, ti.min((chunk + 1) * PIXEL_CHUNK, size)):
             v, u = p // width, p % width
             z = depth[v, u]
-            if z > 0 and normals[v, u, 2] != 0:
+            if normals[v, u, 2] != 0:
                 points[n, 0], points[n, 1], points[n, 2] = (u - cx) / fx * z, (v - cy) / fy * z, z
                 for d in ti.static(range(3)):
                     point_normals[n, d] = normals[v, u, d]

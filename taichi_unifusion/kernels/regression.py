@@ -138,7 +138,7 @@ def encode_cells(
     blocks: ti.i32,
     keys: Ints2,         # (B, 3)
     masks: Masks2,       # (B, 2) occupied cells
-    doubled: Masks2,     # (27, 2) cells of each neighbour that lie in the doubled voxel
+    window: Masks2,      # (27, 2) cells of each neighbour that count
     totals: Ints1,       # (B,) points in the block itself
     starts: Ints1,       # (B,) first row of each block in `cells`
     cells: Floats2,      # (M, 1 + c [+ 3]) root of the count, then the mean targets, and normals if `derivatives`, times it
@@ -168,7 +168,7 @@ def encode_cells(
                             first = starts[b]
                             for half in range(2):
                                 occupied = masks[b, half]
-                                wanted = occupied & doubled[o, half]
+                                wanted = occupied & window[o, half]
                                 while wanted != 0:
                                     k = ti.math.clz(ti.cast(wanted, ti.i32))
                                     wanted ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
@@ -267,6 +267,7 @@ def encode_points(
 @ti.kernel
 def fuse(
     # in:
+    rows: ti.template(), channels: ti.template(),
     voxels: ti.i32,
     slots: Ints1,             # (B,) slot in the map, -1 where none
     latents: Floats3,         # (B, r, c) F'
@@ -282,8 +283,8 @@ def fuse(
         if s >= 0:
             old, new = map_weights[s], weights[v]
             share = new / (old + new)
-            for a in range(latents.shape[1]):
-                for c in range(latents.shape[2]):
+            for a in ti.static(range(rows)):
+                for c in ti.static(range(channels)):
                     map_latents[s, a, c] += (latents[v, a, c] - map_latents[s, a, c]) * share
             map_weights[s] = old + new
             for half in ti.static(range(2)):

@@ -7,7 +7,7 @@ integers, so that they do not depend on the order in which threads add them; who
 
 import taichi as ti
 
-CELLS = 4               # cells per voxel edge
+CELLS = 4               # cells per voxel edge; shifts below rely on it
 BLOCK_CELLS = CELLS**3
 INDEX_HALF = 8192       # voxel indices lie in [-INDEX_HALF, INDEX_HALF): 64 * 4 * 4 * 4 * 4 = 2 * INDEX_HALF per axis
 FIXED = float(1 << 24)  # fixed-point one: steps of 6e-8, room for 5e11 in sums
@@ -125,31 +125,29 @@ def bin_points(
     sums: Sums3,       # (B, 64, c [+ 3]) += values, then position from the cell centre [voxels]
 ):
     for part in range((points.shape[0] + chunk - 1) // chunk):
-        ijk = ti.Vector([INDEX_HALF, 0, 0])
-        b, cell, run = -1, -1, 0
         width = ti.static(channels + (3 if with_positions else 0))
-        total = ti.Vector([ti.i64(0)] * max(width, 1))
+        place = ti.Vector([INDEX_HALF * CELLS, 0, 0])  # of the cell in the lattice of all cells
+        b, run = -1, 0
+        total = ti.Vector([0.0] * max(width, 1))  # in floats over a run: one thread adds it, always in the same order
         for n in range(part * chunk, ti.min((part + 1) * chunk, points.shape[0])):
-            x = row3(points, n) * per_meter
-            voxel = voxel_of(x)
-            if any(voxel != ijk) or cell_of(x, ijk) != cell:  # a run of points in one cell costs one write
+            x = row3(points, n) * (per_meter * CELLS)
+            at = ti.floor(x, ti.i32)
+            if any(at != place):  # a run of points in one cell costs one write
                 if run > 0:
-                    add_run(width, b, cell, run, total, counts, sums)
-                if any(voxel != ijk):
-                    ijk = voxel
-                    b = block[ijk + INDEX_HALF]
-                cell = cell_of(x, ijk)
+                    add_run(width, b, place, run, total, counts, sums)
+                if any((at >> 2) != (place >> 2)):
+                    b = block[(at >> 2) + INDEX_HALF]
+                place = at
                 run = 0
-                total.fill(0)
+                total.fill(0.0)
             run += 1
             for c in ti.static(range(channels)):
-                total[c] += ti.cast(ti.round(values[n, c] * FIXED), ti.i64)
+                total[c] += values[n, c]
             if ti.static(with_positions):
-                offset = x - ijk - cell_center(cell)
                 for d in ti.static(range(3)):
-                    total[channels + d] += ti.cast(ti.round(offset[d] * FIXED), ti.i64)
+                    total[channels + d] += (x[d] - at[d] - 0.5) / CELLS
         if run > 0:
-            add_run(width, b, cell, run, total, counts, sums)
+            add_run(width, b, place, run, total, counts, sums)
 
 
 @ti.kernel
@@ -166,11 +164,13 @@ def block_of_points(
 
 
 @ti.func
-def add_run(channels: ti.template(), b: ti.i32, cell: ti.i32, run: ti.i32, total: ti.template(), counts: ti.template(), sums: ti.template()):
+def add_run(width: ti.template(), b: ti.i32, place: ti.template(), run: ti.i32, total: ti.template(), counts: ti.template(),
+            sums: ti.template()):
     """Add the sums over a run of points to their cell."""
+    cell = ((place[0] & 3) * CELLS + (place[1] & 3)) * CELLS + (place[2] & 3)
     ti.atomic_add(counts[b, cell], run)
-    for c in ti.static(range(channels)):
-        ti.atomic_add(sums[b, cell, c], total[c])
+    for c in ti.static(range(width)):
+        ti.atomic_add(sums[b, cell, c], ti.cast(ti.round(total[c] * FIXED), ti.i64))
 
 
 @ti.func
@@ -278,6 +278,8 @@ def compact_cells(
     # in:
     blocks: ti.i32,
     starts: Ints1,     # (B,) first row of each block
+    masks: Masks2,     # (B, 2) cells that hold points
+    channels: ti.template(),
     # in and out:
     counts: Ints2,     # (B, 64) read, then 0
     sums: Sums3,       # (B, 64, c) read, then 0
@@ -286,13 +288,17 @@ def compact_cells(
 ):
     for b in range(blocks):
         row = starts[b]
-        for cell in range(BLOCK_CELLS):
-            count = counts[b, cell]
-            if count > 0:
-                root = ti.sqrt(ti.cast(count, ti.f32))
+        for half in range(2):
+            mask = masks[b, half]
+            while mask != 0:
+                k = ti.math.clz(ti.cast(mask, ti.i32))
+                mask ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
+                cell = half * 32 + k
+                root = ti.sqrt(ti.cast(counts[b, cell], ti.f32))
+                scale = 1.0 / (root * FIXED)
                 cells[row, 0] = root
-                for c in range(sums.shape[2]):
-                    cells[row, 1 + c] = ti.cast(sums[b, cell, c], ti.f32) / (root * FIXED)
+                for c in ti.static(range(channels)):
+                    cells[row, 1 + c] = ti.cast(sums[b, cell, c], ti.f32) * scale
                     sums[b, cell, c] = ti.i64(0)
                 counts[b, cell] = 0
                 row += 1

@@ -46,7 +46,7 @@ class BaseMap(ABC):
         self._centered = centered
         self._grid = VoxelGrid(settings.encoder.rank + centered, channels)
         self._regressor = Regressor(position_encoding(settings.encoder), self._grid, voxel_size=settings.voxel_size,
-                                    channels=channels, centered=centered, derivatives=derivatives, noise=settings.noise, min_points=settings.min_points)
+                                    channels=channels, centered=centered, derivatives=derivatives, margin=settings.margin, noise=settings.noise, min_points=settings.min_points)
 
     @property
     def voxel_size(self) -> float:
@@ -111,7 +111,7 @@ class BaseMap(ABC):
         if n:
             slots = np.empty(n, np.int32)
             self._grid.claim(n, data.keys, data.weights, slots)
-            regression.fuse(n, slots, data.latents, data.weights, data.masks,
+            regression.fuse(self._grid.rows, self.channels, n, slots, data.latents, data.weights, data.masks,
                             self._grid.latents, self._grid.weights, self._grid.masks)
 
     def save(self, path: str | Path) -> None:

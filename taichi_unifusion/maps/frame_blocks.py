@@ -88,7 +88,7 @@ class FrameBlocks:
         total = int(occupied.sum())
         if total > self.cells.shape[0]:
             self.cells = ti.ndarray(ti.f32, (total * 5 // 4, 1 + self.sums.shape[2]))
-        kernels.compact_cells(self.count, self.starts, self.counts, self.sums, self.cells)
+        kernels.compact_cells(self.count, self.starts, self.masks, self.sums.shape[2], self.counts, self.sums, self.cells)
 
     def bin_support(self, points: NDArray[np.float32], voxel_size: float, support_points: int) -> None:
         """Only the support masks, from points in touched blocks."""

@@ -24,6 +24,7 @@ class Regressor:
     """Encodes the blocks of a frame: F, w for every voxel with enough samples in it."""
 
     def __init__(self, encoding: PositionEncoding, grid: VoxelGrid, *, voxel_size: float, channels: int, centered: bool, derivatives: bool,
+                 margin: int,
                  noise: float, min_points: int) -> None:
         self.encoding, self.grid = encoding, grid
         self.channels, self.centered, self.derivatives = channels, centered, derivatives
@@ -37,8 +38,8 @@ class Regressor:
         self.cell_features = _to_device(self._cell_features())
         on_cpu = grid.runtime.device == "cpu"
         self.workers, self.stride = (CPU_WORKERS, CPU_STRIDE) if on_cpu else (GPU_WORKERS, GPU_STRIDE)
-        self.doubled = ti.ndarray(ti.u32, (27, 2))
-        self.doubled.from_numpy(_doubled_masks())
+        self.window = ti.ndarray(ti.u32, (27, 2))
+        self.window.from_numpy(_window_masks(margin))
         self.tiles = ti.field(ti.f32, (self.workers, self.rows, kernels.TILE))  # a field: its strides are known when compiling
         self.latents = ti.ndarray(ti.f32, (1, 1, 1))
         self.weights = ti.ndarray(ti.f32, (1,))
@@ -64,7 +65,7 @@ class Regressor:
         """Encode from the blocks' compacted cells."""
         self._reserve(blocks.count)
         kernels.encode_cells(self.rank, self.size, self.rows, self.channels, self.centered, self.derivatives,
-                             self.grid.stamp, self.grid.block, blocks.frame, blocks.count, blocks.keys, blocks.masks, self.doubled,
+                             self.grid.stamp, self.grid.block, blocks.frame, blocks.count, blocks.keys, blocks.masks, self.window,
                              blocks.totals, blocks.starts, blocks.cells, self.cell_features, self.min_points, self.noise, self.workers, self.stride,
                              self.tiles, self.latents, self.weights)
 
@@ -91,14 +92,14 @@ class Regressor:
     def fuse(self, blocks: FrameBlocks) -> int:
         """Fuse what was encoded into the map (Eq. 19), with the blocks' support; returns the number of voxels encoded."""
         encoded = self.grid.claim(blocks.count, blocks.keys, self.weights, self.slots)
-        kernels.fuse(blocks.count, self.slots, self.latents, self.weights, blocks.support,
+        kernels.fuse(self.grid.rows, self.channels, blocks.count, self.slots, self.latents, self.weights, blocks.support,
                      self.grid.latents, self.grid.weights, self.grid.masks)
         return encoded
 
 
-def _doubled_masks() -> NDArray[np.uint32]:
-    """(27, 2): the cells of each of the 27 neighbours that lie in the doubled voxel, as bits in the order of `occupancy`."""
-    halves = {-1: range(CELLS // 2, CELLS), 0: range(CELLS), 1: range(CELLS // 2)}
+def _window_masks(margin: int) -> NDArray[np.uint32]:
+    """(27, 2): the cells of each of the 27 neighbours within `margin` cells of a voxel, as bits in the order of `mark_cells`."""
+    halves = {-1: range(CELLS - margin, CELLS), 0: range(CELLS), 1: range(margin)}
     masks = np.zeros((27, 2), np.uint32)
     for o, steps in enumerate(product((-1, 0, 1), repeat=3)):
         for i, j, k in product(*(halves[step] for step in steps)):

@@ -21,6 +21,8 @@ class MapSettings:
     """Voxels with fewer samples in a frame are left out of that frame."""
     sampling: Literal["cells", "points"] = "cells"
     """cells: average a frame's points in 4x4x4 cells a voxel before the regression (fast); points: every point as it is (the paper)."""
+    margin: int = 1
+    """How many cells (quarters of a voxel) around a voxel its regression takes in: 2 is the whole doubled voxel, 1 is faster."""
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
     """The position encoding."""
 
@@ -31,6 +33,8 @@ class MapSettings:
             raise InputError(f"noise: must be positive, got {self.noise}")
         if self.min_points < 1:
             raise InputError(f"min_points: must be at least 1, got {self.min_points}")
+        if self.margin not in (1, 2):
+            raise InputError(f"margin: must be 1 or 2 cells, got {self.margin}")
         _check_choice("sampling", self.sampling, ("cells", "points"))
 
 

@@ -1,0 +1,409 @@
+"""The command line as a user meets it: exit codes, messages, files, and what a bad day leaves behind."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import resource
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
+
+import taichi_unifusion as uf
+from taichi_unifusion import cli, results
+from taichi_unifusion.config import Config, dump_config, load_config
+from taichi_unifusion.io import read_mesh, read_trajectory
+from taichi_unifusion.map_files import read_map
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTPUTS = ["config.yaml", "maps/color.safetensors", "maps/surface.safetensors", "mesh.glb", "mesh.ply", "metrics.json", "preview.png",
+           "trajectory.txt"]
+FILE_LIMIT = 20_000   # bytes; trajectory, configuration and metrics are smaller, maps, meshes and preview larger
+LINKED_FRAMES = 3000  # enough to be interrupted in the middle on any machine
+PATIENCE = 120        # [s] for a process that has to start Taichi on a busy machine
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return write_folder(tmp_path_factory.mktemp("data") / "recording", make_frames(3))
+
+
+@pytest.fixture(scope="module")
+def made(recording, tmp_path_factory):
+    """A results folder; tests that change it work on a copy."""
+    out = tmp_path_factory.mktemp("results") / "made"
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture
+def spoiled(recording, tmp_path):
+    """The recording with its second depth image cut short."""
+    folder = shutil.copytree(recording, tmp_path / "spoiled")
+    image = folder / "depth" / "1.png"
+    image.write_bytes(image.read_bytes()[:200])
+    return folder
+
+
+def files_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+# --- Exit codes and messages ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("arguments", "code", "told"), [
+    (["--help"], 0, ["reconstruct", "mesh", "info", "config"]),
+    (["--version"], 0, [f"unifusion {uf.__version__}"]),
+    (["reconstruct", "--help"], 0, ["FORMAT", "synthetic, 7scenes, replica, tum, scannet, folder", "--every", "unifusion config --help"]),
+    (["config", "--help"], 0, ["--surface.voxel-size", "--preprocess.depth-max", "--mesh.resolution"]),
+    ([], 2, ["reconstruct, mesh, info, config"]),
+    (["reconstrukt"], 2, ["reconstruct, mesh, info, config"]),
+    (["reconstruct", "7scene", "x", "--out", "o"], 2, ["'7scene' is unknown, did you mean '7scenes'?", "scannet"]),
+    (["reconstruct", "folder", "nowhere", "--out", "o"], 2, ["nowhere: no such file or folder"]),
+    (["reconstruct", "synthetic"], 2, ["--out"]),
+    (["reconstruct", "synthetic", "--out", "o", "--surface.voxel-siz", "1"], 2, ["--surface.voxel-size"]),
+    (["reconstruct", "synthetic", "--out", "o", "--surface.voxel-size", "-1"], 2, ["voxel_size: must lie between"]),
+    (["reconstruct", "synthetic", "--out", "o", "--depth-scale", "1000"], 2, ["'depth_scale' is unknown for format 'synthetic'"]),
+    (["reconstruct", "synthetic", "--out", "o", "--start", "60"], 2, ["there is no frame 60, it has 60 frames"]),
+    (["reconstruct", "synthetic", "--out", "o", "--every", "0"], 2, ["every >= 1"]),
+    (["reconstruct", "synthetic", "--out", "o", "--start", "5", "--end", "5"], 2, ["start < end"]),
+    (["config", "--device", "gpu"], 2, ["auto", "cuda", "cpu"]),
+    (["config", "--config", "none.yaml"], 2, ["none.yaml: no such file"]),
+    (["info", "nowhere"], 2, ["nowhere: no such file or folder"]),
+    (["mesh", "nowhere"], 2, ["nowhere: no maps/surface.safetensors"]),
+    (["mesh", "nowhere", "--out", "x.stl"], 2, [".ply, .glb, .obj"]),
+])
+def test_V4_exit_codes_and_messages(arguments, code, told, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == code
+    captured = capsys.readouterr()
+    said = " ".join((captured.err if code else captured.out).replace("│", " ").split())
+    for part in told:
+        assert part in said
+    assert "Traceback" not in said and not any(tmp_path.iterdir())
+
+
+def test_V4_interrupted_is_130(monkeypatch, capsys):
+    def interrupted(options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(cli.COMMANDS, "info", (cli.Info, interrupted))
+    assert cli.main(["info", "x"]) == 130
+    assert "stopped" in capsys.readouterr().err
+
+
+def test_debug_shows_where_an_error_comes_from(monkeypatch):
+    monkeypatch.setenv("UNIFUSION_DEBUG", "1")
+    with pytest.raises(uf.UniFusionError):
+        cli.main(["info", "nowhere"])
+
+
+def test_a_reader_that_leaves_early_is_no_error():
+    code = "import sys\nfrom taichi_unifusion.cli import main\nsys.exit(main(['config', '--help']))"
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b"" and process.wait() == 0
+    process.stderr.close()
+
+
+# --- config ---------------------------------------------------------------------------------------------------------
+
+
+def test_config_prints_what_it_reads(tmp_path, capsys):
+    assert cli.main(["config", *FLAGS]) == 0
+    printed = capsys.readouterr().out
+    assert printed == dump_config(CONFIG)
+    (tmp_path / "all.yaml").write_text(printed)
+    assert cli.main(["config", "--config", str(tmp_path / "all.yaml")]) == 0
+    assert capsys.readouterr().out == printed
+
+
+def test_flags_count_more_than_the_file_and_the_file_more_than_defaults(tmp_path, capsys):
+    path = tmp_path / "some.yaml"
+    path.write_text("threads: 2\nsurface: {voxel_size: 0.2, noise: 3}\n")
+    assert cli.main(["config", f"--config={path}", "--surface.voxel-size", "0.3"]) == 0
+    (tmp_path / "printed.yaml").write_text(capsys.readouterr().out)
+    config = load_config(tmp_path / "printed.yaml")
+    assert (config.surface.voxel_size, config.surface.noise, config.threads) == (0.3, 3.0, 2)
+    assert config.color == Config().color
+
+
+def test_an_unknown_key_names_the_right_ones(tmp_path, capsys):
+    path = tmp_path / "some.yaml"
+    path.write_text("surface: {voxelsize: 1}\n")
+    assert cli.main(["reconstruct", "synthetic", "--config", str(path), "--out", str(tmp_path / "o")]) == 2
+    assert "'surface.voxelsize', did you mean 'voxel_size'?" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+# --- reconstruct ----------------------------------------------------------------------------------------------------
+
+
+def test_the_results_folder_holds_everything(made):
+    assert files_in(made) == OUTPUTS
+    mesh = read_mesh(made / "mesh.ply")
+    assert len(mesh.faces) > 0 and mesh.normals is not None and "color" in mesh.attributes
+    assert load_config(made / "config.yaml") == CONFIG
+    assert len(read_trajectory(made / "trajectory.txt")) == 3
+    assert (made / "preview.png").read_bytes()[:4] == b"\x89PNG" and (made / "mesh.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_the_metrics_agree_with_the_files(made):
+    metrics = json.loads((made / "metrics.json").read_text())
+    mesh = read_mesh(made / "mesh.ply")
+    assert metrics["mesh"] == {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    assert (metrics["device"], metrics["frames"]["used"], metrics["frames"]["skipped"]) == ("cpu", 3, 0)
+    assert list(metrics["milliseconds"]) == ["load", "preprocess", "transform", "surface", "color", "frame"]
+    assert all(value["median"] > 0 and value["mean"] > 0 for stage, value in metrics["milliseconds"].items() if stage != "load")
+    for name, entry in metrics["maps"].items():
+        file = made / "maps" / f"{name}.safetensors"
+        assert (entry["voxels"], entry["file_bytes"]) == (len(read_map(file)[0]["keys"]), file.stat().st_size)
+        assert entry["bytes"] > 0
+    assert metrics["peak_memory_bytes"] > 50e6 and metrics["seconds"]["mesh"] > 0 and "taichi" in metrics["versions"]
+    assert metrics["errors"] == metrics["warnings"] == []
+
+
+def test_V4_json_alone_on_stdout_and_no_bar_without_a_screen(recording, tmp_path, capfd):
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--start", "1", "--every", "5", "--json",
+                     "--mesh.formats", "obj", "--out", str(tmp_path)]) == 0
+    captured = capfd.readouterr()
+    metrics = json.loads(captured.out)
+    assert metrics["frames"]["used"] == 1 and metrics == json.loads((tmp_path / "metrics.json").read_text())
+    assert "frame 1 of 1" in captured.err
+    assert "\x1b" not in captured.err and "\r" not in captured.err and "━" not in captured.err
+    assert (tmp_path / "mesh.obj").exists() and not (tmp_path / "mesh.ply").exists()
+
+
+def test_F7_a_truncated_image_is_skipped_listed_and_the_run_ends_well(spoiled, tmp_path, capsys):
+    arguments = ["reconstruct", "folder", str(spoiled), *FLAGS, "--out", str(tmp_path / "out")]
+    assert cli.main(arguments) == 0
+    captured = capsys.readouterr()
+    image = str(spoiled / "depth" / "1.png")
+    assert "2 used, 1 skipped" in captured.out and image in captured.out and captured.err.count(image) == 1
+    frames = json.loads((tmp_path / "out" / "metrics.json").read_text())["frames"]
+    assert [(entry["frame"], image in entry["message"]) for entry in frames["skipped_frames"]] == [(1, True)]
+
+    assert cli.main([*arguments, "--strict"]) == 2  # and the results so far are on disk
+    captured = capsys.readouterr()
+    assert captured.err.rstrip().splitlines()[-1].startswith(f"unifusion: error: {image}")
+    assert "ended early after 2 of 3 frames" in captured.err
+    assert files_in(tmp_path / "out") == OUTPUTS
+    assert len(read_trajectory(tmp_path / "out" / "trajectory.txt")) == 1
+
+
+def test_no_usable_frame_is_an_error_and_writes_nothing(recording, tmp_path, capsys):
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--depth-scale", "1e6", "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert "none of 3 frames could be used, 3 for 'no usable depth'" in error and "is depth_scale 1000" in error
+    assert files_in(tmp_path / "out") == []
+
+
+@pytest.mark.parametrize("what", ["a file stands in the way", "read-only"])
+def test_R6_a_folder_that_cannot_be_written_is_told_before_the_first_frame(what, recording, tmp_path, capsys):
+    target = tmp_path / "taken"
+    if what == "read-only":
+        target.mkdir(mode=0o500)
+        if os.access(target, os.W_OK):
+            pytest.skip("this user may write anywhere")
+    else:
+        target.write_text("mine")
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--out", str(target / "out")]) == 2
+    error = capsys.readouterr().err
+    assert str(target / "out") in error and "frame 1 of" not in error
+
+
+def test_one_failing_output_does_not_cost_the_others(recording, tmp_path, monkeypatch, capsys):
+    def full(path, mesh):
+        if path.suffix == ".glb":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write_mesh(path, mesh)
+
+    def broken(*arguments, **options):
+        raise RuntimeError("out of ink")
+
+    write_mesh = results.write_mesh
+    monkeypatch.setattr(results, "write_mesh", full)
+    monkeypatch.setattr(results, "render_preview", broken)
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert f"{tmp_path / 'mesh.glb'}: could not be written" in error and "No space left" in error
+    assert f"{tmp_path / 'preview.png'}: could not be written" in error and "out of ink" in error
+    assert files_in(tmp_path) == [name for name in OUTPUTS if name not in ("mesh.glb", "preview.png")]
+    assert len(json.loads((tmp_path / "metrics.json").read_text())["errors"]) == 2
+
+
+def test_R5_a_file_size_limit_keeps_the_old_files_whole(recording, made, tmp_path, capsys):
+    out = shutil.copytree(made, tmp_path / "out")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_LIMIT, hard))
+    try:
+        assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(out)]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    error = capsys.readouterr().err
+    for name in OUTPUTS:
+        if (made / name).stat().st_size > FILE_LIMIT:
+            assert str(out / name) in error and "file-size limit" in error
+            assert (out / name).read_bytes() == (made / name).read_bytes()
+    assert files_in(out) == OUTPUTS and len(read_trajectory(out / "trajectory.txt")) == 1
+
+
+def test_an_empty_mesh_is_said_and_the_rest_is_written(recording, tmp_path, capsys):
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--surface.min-points", "100000",
+                     "--out", str(tmp_path)]) == 2
+    assert "the mesh is empty" in capsys.readouterr().err
+    assert files_in(tmp_path) == [name for name in OUTPUTS if name not in ("mesh.glb", "preview.png")]
+
+
+# --- Signals --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def long_run(recording, tmp_path):
+    """A `reconstruct` process in the middle of its frames, its results folder, and its stderr as lines that wait for it."""
+    folder = tmp_path / "long"
+    for name in ("depth", "color", "poses"):
+        (folder / name).mkdir(parents=True)
+        for source in (recording / name).iterdir():
+            for i in range(int(source.stem), LINKED_FRAMES, 3):
+                (folder / name / f"{i}{source.suffix}").symlink_to(source)
+    shutil.copy(recording / "camera.yaml", folder)
+    out = tmp_path / "out"
+    code = "import sys\nfrom taichi_unifusion.cli import main\nsys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen([sys.executable, "-c", code, "reconstruct", "folder", str(folder), *FLAGS, "--out", str(out)],
+                               cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    watchdog = threading.Timer(PATIENCE, process.kill)
+    watchdog.start()
+    wait_for(process, "frame 1 of")
+    yield process, out
+    watchdog.cancel()
+    process.kill()
+    process.communicate()
+
+
+def wait_for(process: subprocess.Popen, words: str) -> None:
+    for line in process.stderr:
+        if words in line:
+            return
+    raise AssertionError(f"the process ended without saying '{words}'")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_R3_a_signal_while_integrating_writes_everything(long_run, number):
+    process, out = long_run
+    process.send_signal(number)
+    stdout, stderr = process.communicate()
+    assert process.returncode == 130
+    assert "stopped after" in stderr and "stopped early" in stdout and "Traceback" not in stderr
+    assert files_in(out) == OUTPUTS  # and no .tmp
+    frames = json.loads((out / "metrics.json").read_text())["frames"]
+    assert frames["interrupted"] and 0 < frames["used"] < LINKED_FRAMES
+    assert len(read_trajectory(out / "trajectory.txt")) == frames["used"]
+    for name in ("surface", "color"):
+        read_map(out / "maps" / f"{name}.safetensors")
+    assert len(read_mesh(out / "mesh.ply").faces) > 0
+
+
+def test_R3_a_second_signal_stops_at_once_and_leaves_no_temporary_file(long_run):
+    process, out = long_run
+    process.send_signal(signal.SIGINT)
+    wait_for(process, "stopping after this frame")
+    process.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    _, stderr = process.communicate()
+    assert process.returncode == 130 and time.monotonic() - began < PATIENCE / 4
+    assert "unifusion: error: stopped" in stderr and "Traceback" not in stderr
+    assert not [name for name in files_in(out) if name.endswith(".tmp")]
+
+
+def test_a_signal_while_writing_finishes_the_writing(recording, tmp_path, monkeypatch, capfd):
+    def interrupted(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGINT)
+        return render_preview(*arguments, **options)
+
+    render_preview = results.render_preview
+    monkeypatch.setattr(results, "render_preview", interrupted)
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(tmp_path)]) == 130
+    assert "stopping" in capfd.readouterr().err
+    assert files_in(tmp_path) == OUTPUTS
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+# --- mesh and info --------------------------------------------------------------------------------------------------
+
+
+def test_mesh_extracts_again_finer(made, tmp_path, capsys):
+    out = tmp_path / "finer.ply"
+    assert cli.main(["mesh", str(made), "--resolution", "8", "--out", str(out), "--device", "cpu"]) == 0
+    before, after = read_mesh(made / "mesh.ply"), read_mesh(out)
+    assert len(after.faces) > 3 * len(before.faces) and "color" in after.attributes  # a surface's triangles grow with the square
+    assert str(out) in capsys.readouterr().out
+
+    copy = shutil.copytree(made, tmp_path / "copy")
+    for name in ("mesh.ply", "mesh.glb"):
+        (copy / name).unlink()
+    assert cli.main(["mesh", str(copy), "--device", "cpu"]) == 0
+    assert (copy / "mesh.ply").read_bytes() == (made / "mesh.ply").read_bytes() and (copy / "mesh.glb").exists()
+
+
+def test_info_describes_a_folder_a_map_and_a_mesh(made, capsys):
+    voxels = {name: f"{len(read_map(made / 'maps' / f'{name}.safetensors')[0]['keys']):,}" for name in ("surface", "color")}
+    assert cli.main(["info", str(made)]) == 0
+    text = capsys.readouterr().out
+    for part in (*voxels.values(), "10 cm", "5 cm", "rank 20 of 256", "triangles", "normals, color", "3 used, 0 skipped"):
+        assert part in text
+    assert cli.main(["info", str(made / "maps" / "color.safetensors")]) == 0
+    assert voxels["color"] in capsys.readouterr().out
+    assert cli.main(["info", str(made / "mesh.ply")]) == 0
+    assert "triangles" in capsys.readouterr().out
+
+
+def test_M2_info_names_a_damaged_map_and_still_shows_the_rest(made, tmp_path, capsys):
+    copy = shutil.copytree(made, tmp_path / "copy")
+    path = copy / "maps" / "surface.safetensors"
+    data = bytearray(path.read_bytes())
+    data[-100] ^= 1
+    path.write_bytes(data)
+    (copy / "metrics.json").write_text("{}")
+    assert cli.main(["info", str(copy)]) == 2
+    captured = capsys.readouterr()
+    assert f"{path}: tensor" in captured.err and "checksum" in captured.err and "metrics.json" in captured.err
+    assert "property, 3 channels" in captured.out and "triangles" in captured.out
+    assert cli.main(["mesh", str(copy), "--device", "cpu"]) == 2
+    assert "checksum" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "content", "told"), [
+    ("x.safetensors", b"", "the file is empty"),
+    ("x.safetensors", b"\x80\x04pickle..........", "a pickle"),
+    ("x.png", b"\x89PNG\r\n\x1a\n", "not a map file"),
+    ("x.ply", b"ply\n", "x.ply"),
+])
+def test_info_on_what_is_not_ours_is_one_sentence(tmp_path, capsys, name, content, told):
+    path = tmp_path / name
+    path.write_bytes(content)
+    assert cli.main(["info", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert told in error and str(path) in error and error.count("\n") == 1
+    assert cli.main(["info", str(tmp_path)]) == 2
+    assert "holds no results" in capsys.readouterr().err
+
+
+def test_the_app_goes_through_the_same_pipeline(recording, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["reconstruct.py", "folder", str(recording), str(tmp_path)])
+    runpy.run_path(str(ROOT / "apps" / "reconstruct.py"), run_name="__main__")
+    assert "3 frames used, 0 skipped" in capsys.readouterr().out
+    with contextlib.suppress(FileNotFoundError):
+        (tmp_path / "mesh.obj").unlink()
+    assert files_in(tmp_path) == OUTPUTS
