@@ -12,26 +12,25 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
 from dataclasses import dataclass, field
-from io import StringIO
 from pathlib import Path
 from typing import Annotated, Literal, Union
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
-from . import __version__
 from .config import Config, dump_config, load_config
 from .datasets import FORMATS, Dataset, open_dataset
 from .errors import DatasetError, FileError, InputError, UniFusionError
-from .interrupts import stop_on_signal
+from .interrupts import INTERRUPTED, stop_on_signal
 from .terminal import format_bytes, frame_progress, log_to_stderr, summarize
 
 logger = logging.getLogger(__name__)
 
-DONE, FAILED, INTERRUPTED = 0, 2, 130
-DESCRIPTION = "RGB-D frames with camera poses in, a coloured surface out.\n\nunifusion COMMAND --help: explains a command\n\nunifusion --version: prints the version"
+FORMAT_DEFAULT = "(default: the format's)"
+DONE, FAILED = 0, 2
+DESCRIPTION = ("RGB-D frames with camera poses in, a coloured surface out.\n\n"
+               "unifusion COMMAND --help: explains a command\n\nunifusion --version: prints the version")
 
 
 @dataclass(frozen=True)
@@ -58,12 +57,12 @@ class ReconstructOptions:
     """Use every N-th frame."""
     config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(default=None, kw_only=True)
     """YAML file of settings that differ from the defaults; options given here count more."""
-    depth_scale: Annotated[float | None, arg(metavar="S", help_behavior_hint="(default: the format's)")] = field(
+    depth_scale: Annotated[float | None, arg(metavar="S", help_behavior_hint=FORMAT_DEFAULT)] = field(
         default=None, kw_only=True)
     """Units of the depth images that make a metre."""
     drop_alpha: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
     """Accept colour images with a fourth channel and ignore it."""
-    max_difference: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="(default: the format's)")] = field(
+    max_difference: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint=FORMAT_DEFAULT)] = field(
         default=None, kw_only=True)
     """How far time stamps of depth, colour and pose may be apart (tum, folder)."""
     strict: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
@@ -74,7 +73,8 @@ class ReconstructOptions:
     @property
     def reading(self) -> dict[str, object]:
         """Options for `open_dataset`: those that were given."""
-        options = {"depth_scale": self.depth_scale, "drop_alpha": self.drop_alpha or None, "max_difference": self.max_difference}
+        options = {"depth_scale": self.depth_scale, "max_difference": self.max_difference,
+                   "drop_alpha": self.drop_alpha or None}
         return {name: value for name, value in options.items() if value is not None}
 
 
@@ -126,20 +126,15 @@ def reconstruct(options: Reconstruct) -> int:
     from .results import prepare_results, remove_temporaries
 
     directory = prepare_results(options.out)
-    with stop_on_signal() as stop:
-        try:
-            return _run_and_write(options, frames, directory, stop)
-        except KeyboardInterrupt:  # the second signal, which may have come in the middle of a clean-up
-            remove_temporaries(directory)
-            raise
+    with stop_on_signal(clean_up=lambda: remove_temporaries(directory)) as stop:
+        return _run_and_write(options, frames, directory, stop)
 
 
 def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop: Callable[[], bool]) -> int:
     from .pipeline import Pipeline
     from .results import write_results
 
-    with redirect_stdout(StringIO()):  # Taichi announces itself there
-        pipeline = Pipeline(options.settings)
+    pipeline = Pipeline(options.settings)
     with frame_progress(len(frames)) as on_frame:
         run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
     if not run.steps:
@@ -164,7 +159,7 @@ def _select(recording: Dataset, options: ReconstructOptions) -> Dataset:
                          f"every {options.every}")
     frames = recording[options.start:options.end:options.every]
     if not len(frames):
-        raise DatasetError(f"{recording.name}: there is no frame {options.start}, it has {len(recording)} frames (0 is the first)")
+        raise DatasetError(f"{recording.name}: there is no frame {options.start}, it has {len(recording)} (0 is the first)")
     return frames
 
 
@@ -175,22 +170,23 @@ def extract_mesh(options: ExtractMesh) -> int:
     files = [options.out] if options.out else [options.dir / "mesh.ply", options.dir / "mesh.glb"]
     if files[0].suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{files[0]}: a mesh is written as {', '.join(MESH_SUFFIXES)}, not as '{files[0].suffix}'")
-    maps = sorted((options.dir / "maps").glob("*.safetensors"))
-    if options.dir / "maps" / "surface.safetensors" not in maps:
+    maps = {path.stem: path for path in sorted((options.dir / "maps").glob("*.safetensors"))}
+    if "surface" not in maps:
         raise FileError(f"{options.dir}: no maps/surface.safetensors here; give the results folder of `unifusion reconstruct`")
     check_writable(files[0].parent)
     from . import pipeline, runtime
-    from .maps import load_map
+    from .maps import PropertyMap, SurfaceMap
 
-    with redirect_stdout(StringIO()):  # Taichi announces itself there
-        runtime.init(options.device)
-    loaded = {path.stem: load_map(path) for path in maps}
-    mesh = pipeline.extract_mesh(loaded.pop("surface"), loaded, options.resolution)
+    runtime.init(options.device)
+    surface = SurfaceMap.load(maps.pop("surface"))
+    properties = {name: PropertyMap.load(path) for name, path in maps.items()}
+    mesh = pipeline.extract_mesh(surface, properties, options.resolution)
     failures = []
     for file in files:
         try:
             write_mesh(file, mesh)
-            print(f"{file}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {format_bytes(file.stat().st_size)}")
+            print(f"{file}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, "
+                  f"{format_bytes(file.stat().st_size)}")
         except UniFusionError as error:  # the other file may still be written
             failures.append(error)
     return _report(failures)
@@ -244,6 +240,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _dispatch(argv: list[str]) -> int:
     if argv == ["--version"]:
+        from . import __version__
+
         print(f"unifusion {__version__}")
         return DONE
     name, arguments = (argv[0], argv[1:]) if argv and argv[0] in COMMANDS else (None, argv)

@@ -72,7 +72,8 @@ def load_config(path: str | Path, base: Config | None = None) -> Config:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
-        raise ConfigError(f"{path}{where}: not valid YAML ({getattr(error, 'problem', None) or 'unreadable characters'})") from None
+        problem = getattr(error, "problem", None) or "unreadable characters"
+        raise ConfigError(f"{path}{where}: not valid YAML ({problem})") from None
     except (RecursionError, ValueError) as error:  # nested too deep; a date or number that does not exist
         raise ConfigError(f"{path}: not valid YAML ({error})") from None
     return _overlay(base or Config(), values, str(path), "")
@@ -129,7 +130,8 @@ def _convert(value: Any, wanted: Any, at: str) -> Any:
     if origin is Literal:
         if value in options:
             return value
-        raise ConfigError(f"{at}: {reprlib.repr(value)} is unknown{_suggest(str(value), options)}; choose one of {', '.join(options)}")
+        raise ConfigError(f"{at}: {reprlib.repr(value)} is unknown{_suggest(str(value)[:80], options)}; "
+                          f"choose one of {', '.join(options)}")
     if wanted is float and isinstance(value, str):  # YAML 1.1 takes 1e-3, without a point, for text
         with suppress(ValueError):
             value = float(value)

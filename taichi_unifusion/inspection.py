@@ -45,7 +45,8 @@ def inspect(path: Path) -> Inspection:
             return None
 
     rows = [row for row in (attempt(_describe_map, file) for file in maps) if row]
-    texts = [format_table([MAP_COLUMNS, *rows]) if rows else None, attempt(_describe_mesh, mesh), attempt(_describe_run, metrics)]
+    texts = [format_table([MAP_COLUMNS, *rows]) if rows else None,
+             attempt(_describe_mesh, mesh), attempt(_describe_run, metrics)]
     return Inspection("\n\n".join(text for text in texts if text), tuple(problems))
 
 
@@ -56,7 +57,8 @@ def _describe_map(file: Path) -> list[str]:
         settings, encoder = manifest["settings"], manifest["settings"]["encoder"]
         kind = f"{manifest['kind']}, {manifest['channels']} channel{'s' if manifest['channels'] > 1 else ''}"
         return [manifest["name"], kind, f"{len(tensors['keys']):,}", f"{100 * settings['voxel_size']:g} cm",
-                format_bytes(file.stat().st_size), f"Matern-7/2, rank {encoder['rank']} of {encoder['anchors']}, seed {encoder['seed']}",
+                format_bytes(file.stat().st_size),
+                f"Matern-7/2, rank {encoder['rank']} of {encoder['anchors']}, seed {encoder['seed']}",
                 manifest["fusion"], str(manifest["format_version"])]
     except (KeyError, TypeError) as error:
         raise MapCorrupt(f"{file}: its manifest does not describe a map ({error}); write it again") from error
@@ -65,7 +67,8 @@ def _describe_map(file: Path) -> list[str]:
 def _describe_mesh(file: Path) -> str:
     mesh = read_mesh(file)
     carries = ["normals"] * (mesh.normals is not None) + list(mesh.attributes)
-    text = f"mesh    {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, with {', '.join(carries) or 'neither normals nor colour'}"
+    text = (f"mesh    {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, "
+            f"with {', '.join(carries) or 'neither normals nor colour'}")
     if not len(mesh.vertices):
         return text
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)

@@ -4,23 +4,36 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-MESSAGE = b"\nunifusion: stopping after this frame; what is done is written (once more: stop at once, write nothing)\n"
+INTERRUPTED = 130  # exit code
+
+STOPPING = b"\nunifusion: stopping: this frame is finished, then everything is written (once more: stop at once)\n"
+STOPPED = b"\nunifusion: error: stopped\n"
+SHOW_CURSOR = b"\x1b[?25h"  # progress bars hide it
 
 
 @contextmanager
-def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Gives a function that says whether a stop was asked for; a second signal raises KeyboardInterrupt."""
+def stop_on_signal(clean_up: Callable[[], None]) -> Iterator[Callable[[], bool]]:
+    """Gives a function that says whether a stop was asked for; at a second signal, `clean_up` and the end of the process.
+
+    The second does not raise KeyboardInterrupt: that may come up in the middle of a clean-up, or where Python ignores it.
+    """
     requested = threading.Event()
 
     def handle(number: int, stack: object) -> None:
-        if requested.is_set():
-            raise KeyboardInterrupt
-        requested.set()
-        os.write(2, MESSAGE)  # not through sys.stderr or logging, which may be in the middle of a line
+        if not requested.is_set():
+            requested.set()
+            os.write(2, STOPPING)  # not through sys.stderr or logging, which may be in the middle of a line
+            return
+        try:
+            clean_up()
+            os.write(2, STOPPED + SHOW_CURSOR if sys.stderr.isatty() else STOPPED)
+        finally:
+            os._exit(INTERRUPTED)
 
     if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
         yield requested.is_set

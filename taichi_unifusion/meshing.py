@@ -25,8 +25,8 @@ STEPS = np.array(list(product((0, 1), repeat=3)))  # (8, 3) corners of a cube, x
 NORMAL_UNIT = float(1 << 18)                       # fixed-point one of summed normals, in squared grid spacings
 
 
-def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float, resolution: int, support_reach: int | None) -> Mesh:
-    """Zero level of the blended field on `resolution`^3 cells a voxel, only within `support_reach` cells of supported ones unless None."""
+def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float, resolution: int, support_reach: int) -> Mesh:
+    """Zero level of the blended field on `resolution`^3 cells a voxel, only within `support_reach` cells of supported ones."""
     keys, support = _cubes(grid, support_reach)
     if not len(keys):
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
@@ -41,12 +41,12 @@ def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float,
     return Mesh(vertices, faces, normals.astype(np.float32))
 
 
-def _cubes(grid: VoxelGrid, support_reach: int | None) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
+def _cubes(grid: VoxelGrid, support_reach: int) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
     """Sorted keys (Q, 3) of the cubes that hold surface or close one that does, and their support masks (Q, 2)."""
     data = grid.export()
     keys = unique_rows((data.keys[:, None] + STEPS).reshape(-1, 3))
-    support = np.full((len(keys), 2), 0xFFFFFFFF, np.uint32)
-    if support_reach is not None and len(keys):
+    support = np.empty((len(keys), 2), np.uint32)
+    if len(keys):
         query.corner_support(keys, grid.slot, grid.masks, support_reach, support)
         keys = keys[support.any(axis=1)]
         keys = unique_rows((keys[:, None] + STEPS).reshape(-1, 3))  # the last cells of a cube need the samples above

@@ -89,15 +89,15 @@ class Pipeline:
 
     def extract_mesh(self, resolution: int | None = None) -> Mesh:
         """The mesh of all that was fused so far, coloured; `resolution` overrides the configuration's."""
-        return extract_mesh(self.surface, self.properties, resolution or self.config.mesh.resolution)
+        return extract_mesh(self.surface, self.properties, self.config.mesh.resolution if resolution is None else resolution)
 
 
 def extract_mesh(surface: SurfaceMap, properties: Mapping[str, PropertyMap], resolution: int) -> Mesh:
     """The surface as a mesh that carries every property that has data."""
     mesh = surface.extract_mesh(resolution)
-    for name, field_ in properties.items():
-        if len(field_) and len(mesh.vertices):
-            mesh = mesh.with_attribute(name, field_.query(mesh.vertices))
+    for name, source in properties.items():
+        if len(source) and len(mesh.vertices):
+            mesh = mesh.with_attribute(name, source.query(mesh.vertices))
     return mesh
 
 

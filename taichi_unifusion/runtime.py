@@ -9,9 +9,12 @@ from __future__ import annotations
 import logging
 import os
 import platform
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
+from io import StringIO
+from pathlib import Path
 
-from .errors import CapacityError, InputError, RuntimeStateError
+from .errors import CapacityError, InputError, MissingDependency, RuntimeStateError
 
 logger = logging.getLogger(__name__)
 
@@ -51,14 +54,13 @@ def init(device: str = "auto", *, threads: int | None = None, device_memory_gb: 
         if device in ("auto", _runtime.device):
             return _runtime
         raise RuntimeStateError(f"device: Taichi already runs on {_runtime.device}; start a new process to use {device}")
-    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-    import taichi as ti
-
+    ti = _import_taichi()
     options = dict(log_level=ti.ERROR, offline_cache=True, debug=debug, default_fp=ti.f32, default_ip=ti.i32)
     if threads:
         options["cpu_max_num_threads"] = threads
     wanted = ti.cpu if device == "cpu" else ti.cuda  # never ti.gpu: Vulkan has no pointer SNodes
-    ti.init(arch=wanted, device_memory_GB=device_memory_gb, **options)
+    with redirect_stdout(StringIO()):  # what we run on is said by us, where people look for it
+        ti.init(arch=wanted, device_memory_GB=device_memory_gb, **options)
     found = "cuda" if ti.lang.impl.current_cfg().arch == ti.cuda else "cpu"
     if device == "cuda" and found != "cuda":
         raise RuntimeStateError("device: CUDA was asked for but Taichi finds none; use device 'cpu' or check the NVIDIA driver")
@@ -86,7 +88,28 @@ def synchronize() -> None:
     ti.sync()
 
 
+def _import_taichi():
+    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+    try:
+        import taichi
+    except (ImportError, OSError) as error:
+        if "libX11" in str(error):
+            raise MissingDependency("Taichi needs the system library libX11; run: apt-get install -y libx11-6") from error
+        raise
+    return taichi
+
+
 def _describe(device: str, threads: int | None) -> str:
     if device == "cuda":
         return "CUDA GPU"
-    return f"CPU ({platform.processor() or platform.machine()}, {threads or os.cpu_count()} threads)"
+    return f"CPU ({_cpu_name()}, {threads or os.cpu_count()} threads)"
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -16,8 +16,9 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
-from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
+from tiny_recording import CONFIG, DEVICE, FLAGS, make_frames, write_folder
 
 import taichi_unifusion as uf
 from taichi_unifusion import cli, results
@@ -26,10 +27,12 @@ from taichi_unifusion.io import read_mesh, read_trajectory
 from taichi_unifusion.map_files import read_map
 
 ROOT = Path(__file__).resolve().parents[1]
-OUTPUTS = ["config.yaml", "maps/color.safetensors", "maps/surface.safetensors", "mesh.glb", "mesh.ply", "metrics.json", "preview.png",
-           "trajectory.txt"]
+OUTPUTS = ["config.yaml", "maps/color.safetensors", "maps/surface.safetensors", "mesh.glb", "mesh.ply", "metrics.json",
+           "preview.png", "trajectory.txt"]
 FILE_LIMIT = 20_000   # bytes; trajectory, configuration and metrics are smaller, maps, meshes and preview larger
 LINKED_FRAMES = 3000  # enough to be interrupted in the middle on any machine
+SAME_VERTEX = 2e-6    # [m] rounding of float32: another map's kernels are compiled anew
+SAME_COLOR = 1.01 / 255  # 8-bit colours that round the other way
 PATIENCE = 120        # [s] for a process that has to start Taichi on a busy machine
 
 
@@ -65,7 +68,8 @@ def files_in(folder: Path) -> list[str]:
 @pytest.mark.parametrize(("arguments", "code", "told"), [
     (["--help"], 0, ["reconstruct", "mesh", "info", "config"]),
     (["--version"], 0, [f"unifusion {uf.__version__}"]),
-    (["reconstruct", "--help"], 0, ["FORMAT", "synthetic, 7scenes, replica, tum, scannet, folder", "--every", "unifusion config --help"]),
+    (["reconstruct", "--help"], 0, ["FORMAT", "synthetic, 7scenes, replica, tum, scannet, folder", "--every",
+                                    "unifusion config --help"]),
     (["config", "--help"], 0, ["--surface.voxel-size", "--preprocess.depth-max", "--mesh.resolution"]),
     ([], 2, ["reconstruct, mesh, info, config"]),
     (["reconstrukt"], 2, ["reconstruct, mesh, info, config"]),
@@ -74,8 +78,8 @@ def files_in(folder: Path) -> list[str]:
     (["reconstruct", "synthetic"], 2, ["--out"]),
     (["reconstruct", "synthetic", "--out", "o", "--surface.voxel-siz", "1"], 2, ["--surface.voxel-size"]),
     (["reconstruct", "synthetic", "--out", "o", "--surface.voxel-size", "-1"], 2, ["voxel_size: must lie between"]),
-    (["reconstruct", "synthetic", "--out", "o", "--depth-scale", "1000"], 2, ["'depth_scale' is unknown for format 'synthetic'"]),
-    (["reconstruct", "synthetic", "--out", "o", "--start", "60"], 2, ["there is no frame 60, it has 60 frames"]),
+    (["reconstruct", "synthetic", "--out", "o", "--depth-scale", "1000"], 2, ["'depth_scale' is unknown for format"]),
+    (["reconstruct", "synthetic", "--out", "o", "--start", "60"], 2, ["there is no frame 60, it has 60 (0 is the first)"]),
     (["reconstruct", "synthetic", "--out", "o", "--every", "0"], 2, ["every >= 1"]),
     (["reconstruct", "synthetic", "--out", "o", "--start", "5", "--end", "5"], 2, ["start < end"]),
     (["config", "--device", "gpu"], 2, ["auto", "cuda", "cpu"]),
@@ -163,7 +167,7 @@ def test_the_metrics_agree_with_the_files(made):
     metrics = json.loads((made / "metrics.json").read_text())
     mesh = read_mesh(made / "mesh.ply")
     assert metrics["mesh"] == {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
-    assert (metrics["device"], metrics["frames"]["used"], metrics["frames"]["skipped"]) == ("cpu", 3, 0)
+    assert (metrics["device"], metrics["frames"]["used"], metrics["frames"]["skipped"]) == (DEVICE, 3, 0)
     assert list(metrics["milliseconds"]) == ["load", "preprocess", "transform", "surface", "color", "frame"]
     assert all(value["median"] > 0 and value["mean"] > 0 for stage, value in metrics["milliseconds"].items() if stage != "load")
     for name, entry in metrics["maps"].items():
@@ -203,10 +207,11 @@ def test_F7_a_truncated_image_is_skipped_listed_and_the_run_ends_well(spoiled, t
 
 
 def test_no_usable_frame_is_an_error_and_writes_nothing(recording, tmp_path, capsys):
-    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--depth-scale", "1e6", "--out", str(tmp_path / "out")]) == 2
+    out = tmp_path / "out"
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--depth-scale", "1e6", "--out", str(out)]) == 2
     error = capsys.readouterr().err
     assert "none of 3 frames could be used, 3 for 'no usable depth'" in error and "is depth_scale 1000" in error
-    assert files_in(tmp_path / "out") == []
+    assert files_in(out) == []
 
 
 @pytest.mark.parametrize("what", ["a file stands in the way", "read-only"])
@@ -318,7 +323,7 @@ def test_R3_a_signal_while_integrating_writes_everything(long_run, number):
 def test_R3_a_second_signal_stops_at_once_and_leaves_no_temporary_file(long_run):
     process, out = long_run
     process.send_signal(signal.SIGINT)
-    wait_for(process, "stopping after this frame")
+    wait_for(process, "stopping: this frame")
     process.send_signal(signal.SIGINT)
     began = time.monotonic()
     _, stderr = process.communicate()
@@ -335,7 +340,7 @@ def test_a_signal_while_writing_finishes_the_writing(recording, tmp_path, monkey
     render_preview = results.render_preview
     monkeypatch.setattr(results, "render_preview", interrupted)
     assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(tmp_path)]) == 130
-    assert "stopping" in capfd.readouterr().err
+    assert "stopping: " in capfd.readouterr().err
     assert files_in(tmp_path) == OUTPUTS
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -345,16 +350,21 @@ def test_a_signal_while_writing_finishes_the_writing(recording, tmp_path, monkey
 
 def test_mesh_extracts_again_finer(made, tmp_path, capsys):
     out = tmp_path / "finer.ply"
-    assert cli.main(["mesh", str(made), "--resolution", "8", "--out", str(out), "--device", "cpu"]) == 0
+    assert cli.main(["mesh", str(made), "--resolution", "8", "--out", str(out), "--device", DEVICE]) == 0
     before, after = read_mesh(made / "mesh.ply"), read_mesh(out)
-    assert len(after.faces) > 3 * len(before.faces) and "color" in after.attributes  # a surface's triangles grow with the square
+    assert len(after.faces) > 3 * len(before.faces)  # triangles of a surface grow with the square
+    assert "color" in after.attributes
     assert str(out) in capsys.readouterr().out
 
     copy = shutil.copytree(made, tmp_path / "copy")
     for name in ("mesh.ply", "mesh.glb"):
         (copy / name).unlink()
-    assert cli.main(["mesh", str(copy), "--device", "cpu"]) == 0
-    assert (copy / "mesh.ply").read_bytes() == (made / "mesh.ply").read_bytes() and (copy / "mesh.glb").exists()
+    assert cli.main(["mesh", str(copy), "--device", DEVICE]) == 0
+    again = read_mesh(copy / "mesh.ply")
+    np.testing.assert_array_equal(again.faces, before.faces)
+    np.testing.assert_allclose(again.vertices, before.vertices, atol=SAME_VERTEX)
+    np.testing.assert_allclose(again.attributes["color"], before.attributes["color"], atol=SAME_COLOR)
+    assert (copy / "mesh.glb").exists()
 
 
 def test_info_describes_a_folder_a_map_and_a_mesh(made, capsys):
@@ -380,8 +390,15 @@ def test_M2_info_names_a_damaged_map_and_still_shows_the_rest(made, tmp_path, ca
     captured = capsys.readouterr()
     assert f"{path}: tensor" in captured.err and "checksum" in captured.err and "metrics.json" in captured.err
     assert "property, 3 channels" in captured.out and "triangles" in captured.out
-    assert cli.main(["mesh", str(copy), "--device", "cpu"]) == 2
+    assert cli.main(["mesh", str(copy), "--device", DEVICE]) == 2
     assert "checksum" in capsys.readouterr().err
+
+
+def test_mesh_refuses_a_map_of_another_kind(made, tmp_path, capsys):
+    copy = shutil.copytree(made, tmp_path / "copy")
+    shutil.copy(copy / "maps" / "color.safetensors", copy / "maps" / "surface.safetensors")
+    assert cli.main(["mesh", str(copy), "--device", DEVICE]) == 2
+    assert "kind 'property', not 'surface'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("name", "content", "told"), [

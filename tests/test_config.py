@@ -35,7 +35,8 @@ def test_an_empty_file_or_section_changes_nothing(tmp_path, text):
 
 
 def test_a_file_changes_what_it_says_and_nothing_else(tmp_path):
-    config = load_config(write(tmp_path, "threads: 1\nsurface: {voxel_size: 1}\ncolor:\n  encoder: {rank: 12}\nmesh: {formats: [glb]}\n"))
+    text = "threads: 1\nsurface: {voxel_size: 1}\ncolor:\n  encoder: {rank: 12}\nmesh: {formats: [glb]}\n"
+    config = load_config(write(tmp_path, text))
     base = Config()
     assert config == dataclasses.replace(
         base, threads=1, surface=dataclasses.replace(base.surface, voxel_size=1.0),
@@ -78,8 +79,8 @@ def test_I5_what_does_not_fit_is_named_by_its_path(tmp_path, text, told):
         assert part in str(raised.value)
 
 
-@pytest.mark.parametrize("text", ["surface: [", "a: b: c", "threads: 1\nthreads: 2", "? [a]\n: 1", "x: 2001-99-99", "a: \0", "[" * 3000,
-                                  "a: !!python/object/apply:os.getcwd []", "\xff"])
+@pytest.mark.parametrize("text", ["surface: [", "a: b: c", "threads: 1\nthreads: 2", "? [a]\n: 1", "x: 2001-99-99", "a: \0",
+                                  "[" * 3000, "a: !!python/object/apply:os.getcwd []", "\xff"])
 def test_I5_what_is_no_plain_yaml_is_refused(tmp_path, text):
     path = tmp_path / "settings.yaml"
     path.write_bytes(text.encode("latin-1"))
@@ -89,8 +90,9 @@ def test_I5_what_is_no_plain_yaml_is_refused(tmp_path, text):
 
 def test_I5_no_code_runs(tmp_path):
     target = tmp_path / "made"
+    path = write(tmp_path, f"threads: !!python/object/apply:os.mkdir ['{target}']")
     with pytest.raises(ConfigError):
-        load_config(write(tmp_path, f"threads: !!python/object/apply:pathlib.Path.touch [!!python/object/apply:pathlib.Path ['{target}']]"))
+        load_config(path)
     assert not target.exists()
 
 
@@ -109,7 +111,7 @@ def test_a_missing_file_is_named(tmp_path):
         load_config(tmp_path / "none.yaml")
 
 
-@pytest.mark.parametrize("build", [lambda: MeshSettings(resolution=0), lambda: MeshSettings(resolution=33), lambda: Config(threads=-1)])
+@pytest.mark.parametrize("build", [lambda: MeshSettings(resolution=0), lambda: MeshSettings(33), lambda: Config(threads=-1)])
 def test_the_constructors_check_ranges(build):
     with pytest.raises(InputError):
         build()

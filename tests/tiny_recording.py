@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,11 +15,13 @@ from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.maps.settings import PropertySettings, SurfaceSettings
 from taichi_unifusion.types import Frame
 
+DEVICE = os.environ.get("UNIFUSION_DEVICE", "cpu")
 WIDTH, HEIGHT, DEPTH_SCALE = 160, 120, 1000.0
 
 # A pixel spans 1.4 cm at 2 m: voxels as large as that asks for.
-CONFIG = Config(device="cpu", surface=SurfaceSettings(voxel_size=0.1, support_points=1), color=PropertySettings(voxel_size=0.05))
-FLAGS = ["--device", "cpu", "--surface.voxel-size", "0.1", "--surface.support-points", "1", "--color.voxel-size", "0.05"]
+CONFIG = Config(device=DEVICE, surface=SurfaceSettings(voxel_size=0.1, support_points=1),
+                color=PropertySettings(voxel_size=0.05))
+FLAGS = ["--device", DEVICE, "--surface.voxel-size", "0.1", "--surface.support-points", "1", "--color.voxel-size", "0.05"]
 
 
 def make_frames(count: int) -> list[Frame]:

@@ -67,8 +67,7 @@ def corner_support(
     support: Masks2,       # (Q, 2) cells of the cube within reach of a supported one, as `occupancy` numbers them
 ):
     for q in range(keys.shape[0]):
-        for half in ti.static(range(2)):
-            support[q, half] = ti.u32(0)
+        reached = ti.Vector([ti.u32(0), ti.u32(0)])
         for o in range(8):
             s = corner_slot(keys, q, o, slot)
             if s >= 0:
@@ -85,7 +84,9 @@ def corner_support(
                             for j in range(ti.max(at[1] - reach, 0), ti.min(at[1] + reach + 1, CELLS)):
                                 for l in range(ti.max(at[2] - reach, 0), ti.min(at[2] + reach + 1, CELLS)):
                                     bit = (i * CELLS + j) * CELLS + l
-                                    support[q, bit // 32] |= ti.u32(1) << ti.cast(31 - bit % 32, ti.u32)
+                                    reached[bit // 32] |= ti.u32(1) << ti.cast(31 - bit % 32, ti.u32)
+        for half in ti.static(range(2)):
+            support[q, half] = reached[half]
 
 
 @ti.kernel

@@ -214,7 +214,7 @@ def encode_points(
     anchors: Floats2,     # (3, A)
     projection: Floats2,  # (l, A)
     scale: ti.f32,
-    minimum: ti.i32,
+    minimum: ti.i32,      # doubled voxels with fewer samples are not encoded
     noise: ti.f32,
     workers: ti.i32, stride: ti.i32,
     # out:
@@ -228,39 +228,39 @@ def encode_points(
                     tiles[worker, row, k] = 0.0
             for v in range(worker * blocks // workers, (worker + 1) * blocks // workers):
                 weights[v] = 0.0
-                if starts[v + 1] - starts[v] >= minimum:
-                    G = ti.Vector([0.0] * (rows * size))
-                    mean = ti.Vector([0.0] * channels)
-                    ijk = row3(keys, v)
-                    filled, weight = 0, 0.0
-                    for o in range(27):
-                        b, step = neighbor_block(ijk, o, frame, stamp, block)
-                        if b >= 0:
-                            for n in range(starts[b], starts[b + 1]):
-                                t = (row3(samples, n) - ijk - 0.5) * 0.5
-                                if ti.abs(t).max() <= 0.5:
-                                    f = position_features(t, rank, anchors, projection, scale)
-                                    for a in ti.static(range(rank)):
-                                        tiles[worker, a, filled] = f[a]
-                                    for c in ti.static(range(channels)):
-                                        tiles[worker, size + c, filled] = targets[n, c]
-                                        mean[c] += targets[n, c]
-                                    if ti.static(centered):
-                                        tiles[worker, size + channels, filled] = 1.0
-                                    filled += 1
-                                    if ti.static(derivatives):
-                                        for axis in range(3):
-                                            g = position_gradient(t, axis, rank, anchors, projection, scale)
-                                            for a in ti.static(range(rank)):
-                                                tiles[worker, a, filled] = 0.5 * g[a]  # d/dx = 1/2 d/dt
-                                            tiles[worker, size, filled] = targets[n, 1 + axis]
-                                            filled += 1
-                                    weight += 1.0
-                                    if filled > TILE - 4:
-                                        flush(size, rows, worker, filled, tiles, G)
-                                        filled = 0
-                    if filled > 0:
-                        flush(size, rows, worker, filled, tiles, G)
+                G = ti.Vector([0.0] * (rows * size))
+                mean = ti.Vector([0.0] * channels)
+                ijk = row3(keys, v)
+                filled, weight = 0, 0.0
+                for o in range(27):
+                    b, step = neighbor_block(ijk, o, frame, stamp, block)
+                    if b >= 0:
+                        for n in range(starts[b], starts[b + 1]):
+                            t = (row3(samples, n) - ijk - 0.5) * 0.5
+                            if ti.abs(t).max() <= 0.5:
+                                f = position_features(t, rank, anchors, projection, scale)
+                                for a in ti.static(range(rank)):
+                                    tiles[worker, a, filled] = f[a]
+                                for c in ti.static(range(channels)):
+                                    tiles[worker, size + c, filled] = targets[n, c]
+                                    mean[c] += targets[n, c]
+                                if ti.static(centered):
+                                    tiles[worker, size + channels, filled] = 1.0
+                                filled += 1
+                                if ti.static(derivatives):
+                                    for axis in range(3):
+                                        g = position_gradient(t, axis, rank, anchors, projection, scale)
+                                        for a in ti.static(range(rank)):
+                                            tiles[worker, a, filled] = 0.5 * g[a]  # d/dx = 1/2 d/dt
+                                        tiles[worker, size, filled] = targets[n, 1 + axis]
+                                        filled += 1
+                                weight += 1.0
+                                if filled > TILE - 4:
+                                    flush(size, rows, worker, filled, tiles, G)
+                                    filled = 0
+                if filled > 0:
+                    flush(size, rows, worker, filled, tiles, G)
+                if weight >= minimum:
                     solve_voxel(v, rank, size, rows, channels, centered, noise, weight, mean, G, latents, weights)
 
 
@@ -283,9 +283,12 @@ def fuse(
         if s >= 0:
             old, new = map_weights[s], weights[v]
             share = new / (old + new)
-            for a in ti.static(range(rows)):
+            for a in range(rows):
+                old_row = ti.Vector([map_latents[s, a, c] for c in ti.static(range(channels))])  # all reads before all writes
+                new_row = ti.Vector([latents[v, a, c] for c in ti.static(range(channels))])
+                fused = old_row + (new_row - old_row) * share
                 for c in ti.static(range(channels)):
-                    map_latents[s, a, c] += (latents[v, a, c] - map_latents[s, a, c]) * share
+                    map_latents[s, a, c] = fused[c]
             map_weights[s] = old + new
             for half in ti.static(range(2)):
-                map_masks[s, half] |= masks[v, half]
+                map_masks[s, half] = map_masks[s, half] | masks[v, half]  # `|=` would be atomic

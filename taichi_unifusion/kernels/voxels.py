@@ -92,6 +92,7 @@ def touch_points(
     per_meter: ti.f32,  # 1 / voxel size
     frame: ti.i32,
     chunk: ti.i32,     # consecutive points that one thread takes
+    spread: ti.template(),  # touch all 8 doubled voxels that contain a point; else its own voxel
     # out:
     stamp: ti.template(), block: ti.template(),
     keys: Ints2,       # (B, 3) voxel of each block
@@ -102,9 +103,10 @@ def touch_points(
         for n in range(part * chunk, ti.min((part + 1) * chunk, points.shape[0])):
             x = row3(points, n) * per_meter
             if all_within(x, INDEX_HALF - 1.0):
-                ijk = voxel_of(x)
+                ijk = voxel_of(x - 0.5) if ti.static(spread) else voxel_of(x)
                 if any(ijk != previous):  # neighbours in the image mostly share a voxel
-                    touch(ijk, frame, stamp, block, keys, counters)
+                    for o in range(8 if ti.static(spread) else 1):
+                        touch(ijk + ti.Vector([o // 4, o // 2 % 2, o % 2]), frame, stamp, block, keys, counters)
                     previous = ijk
             else:
                 ti.atomic_add(counters[1], 1)
@@ -252,7 +254,7 @@ def mark_cells(
     minimum: ti.i32,
     # out:
     masks: Masks2,    # (B, 2) bit 31-k of word j: cell 32 j + k holds a point
-    support: Masks2,  # (B, 2) the same, for at least `minimum` points
+    support: Masks2,  # (B, 2) the same, for at least `minimum` points; 0 sets all of a block with points
     totals: Ints1,    # (B,) points
     cells: Ints1,     # (B,) cells that hold points
 ):
@@ -262,14 +264,17 @@ def mark_cells(
             mask, enough = ti.u32(0), ti.u32(0)
             for k in range(32):
                 count = counts[b, half * 32 + k]
+                bit = ti.u32(1) << ti.cast(31 - k, ti.u32)
                 if count > 0:
-                    bit = ti.u32(1) << ti.cast(31 - k, ti.u32)
                     mask |= bit
-                    if count >= minimum:
-                        enough |= bit
                     total += count
                     occupied += 1
+                if count >= minimum:
+                    enough |= bit
             masks[b, half], support[b, half] = mask, enough
+        if total == 0:
+            for half in ti.static(range(2)):
+                support[b, half] = ti.u32(0)
         totals[b], cells[b] = total, occupied
 
 

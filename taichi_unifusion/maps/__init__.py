@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from .settings import MapSettings, PropertySettings, SurfaceSettings
     from .surface_map import SurfaceMap
 
-__all__ = ["BaseMap", "Integration", "MapSettings", "PropertyMap", "PropertySettings", "SurfaceMap", "SurfaceSettings", "load_map"]
+__all__ = ["BaseMap", "Integration", "MapSettings", "PropertyMap", "PropertySettings", "SurfaceMap", "SurfaceSettings",
+           "load_map"]
 
 _MODULES = {"BaseMap": "base_map", "Integration": "base_map", "PropertyMap": "property_map", "SurfaceMap": "surface_map",
             "MapSettings": "settings", "PropertySettings": "settings", "SurfaceSettings": "settings"}

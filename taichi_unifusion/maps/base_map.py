@@ -91,7 +91,7 @@ class BaseMap(ABC):
 
     def _encode_samples(self, blocks: FrameBlocks, samples: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
         """Encode samples (N, 3) world [m] with targets (N, c), each as it is, after touching their voxels."""
-        blocks.touch(samples, self.voxel_size)
+        blocks.touch(samples, self.voxel_size, spread=True)
         block_of = np.empty(len(samples), np.int32)
         voxels.block_of_points(samples, 1.0 / self.voxel_size, self._grid.block, block_of)
         order = np.argsort(block_of, kind="stable")

@@ -37,13 +37,16 @@ class FrameBlocks:
     def capacity(self) -> int:
         return self.keys.shape[0]
 
-    def touch(self, points: NDArray[np.float32], voxel_size: float) -> None:
-        """Give every voxel that holds a point a block number; raises OutOfRange for points beyond the index range."""
+    def touch(self, points: NDArray[np.float32], voxel_size: float, spread: bool = False) -> None:
+        """Give every voxel that holds a point, or whose doubled voxel does (`spread`), a block number.
+
+        Raises OutOfRange for points beyond the index range.
+        """
         while True:
             self.frame = self.grid.next_frame()
             counters = np.zeros(2, np.int32)
-            kernels.touch_points(points, 1.0 / voxel_size, self.frame, self.chunk, self.grid.stamp, self.grid.block,
-                                 self.keys, counters)
+            kernels.touch_points(points, 1.0 / voxel_size, self.frame, self.chunk, spread, self.grid.stamp,
+                                 self.grid.block, self.keys, counters)
             ti.sync()
             self.count, outside = int(counters[0]), int(counters[1])
             if outside:

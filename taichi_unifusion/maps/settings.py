@@ -47,7 +47,7 @@ class SurfaceSettings(MapSettings):
     sample_distance: float = 0.15
     """Distance of the off-surface samples along the normal, in voxels (d_s)."""
     support_points: int = 3
-    """A 1/4-voxel cell counts as seen once this many points of one frame fell into it; surface is extracted only near such cells."""
+    """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one frame; 0: everywhere in voxels that did."""
 
     support_reach: int = 0
     """How many cells beyond seen cells surface may be extracted."""

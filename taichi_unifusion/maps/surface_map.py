@@ -58,7 +58,7 @@ class SurfaceMap(BaseMap):
             if self._surfels.touch_samples(self._steps):
                 break
         self._samples.bin_samples(self._surfels, self._steps)
-        self._samples.compact(max(self.settings.support_points, 1))
+        self._samples.compact(self.settings.support_points)
         self._regressor.encode_cells(self._samples)
         return self._samples
 
@@ -69,7 +69,7 @@ class SurfaceMap(BaseMap):
             cloud.normals, (len(self._steps), 1))
         targets = np.hstack([steps, np.tile(cloud.normals, (len(self._steps), 1))]) if self._regressor.derivatives else steps
         self._encode_samples(self._samples, samples, targets)
-        self._samples.bin_support(samples, self.voxel_size, max(self.settings.support_points, 1))
+        self._samples.bin_support(samples, self.voxel_size, self.settings.support_points)
         return self._samples
 
     def sdf(self, points: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -86,5 +86,4 @@ class SurfaceMap(BaseMap):
         runtime.check_alive(self._grid.runtime)
         if not 1 <= resolution <= 32:
             raise InputError(f"extract_mesh: resolution must lie in 1..32 cells a voxel, got {resolution}")
-        return extract_mesh(self._grid, self._regressor.encoding, self.voxel_size, resolution,
-                            support_reach=self.settings.support_reach if self.settings.support_points else None)
+        return extract_mesh(self._grid, self._regressor.encoding, self.voxel_size, resolution, self.settings.support_reach)

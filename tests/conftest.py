@@ -1,0 +1,41 @@
+"""Taichi starts once for all tests; data sets that the repository cannot hold are found or skipped."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import taichi_unifusion as uf
+
+DEVICE = os.environ.get("UNIFUSION_DEVICE", "cpu")
+DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "data: reads a real recording; skipped where it is not at hand")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "data" in getattr(item, "fixturenames", ()):
+            item.add_marker("data")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def runtime():
+    """The one Taichi of the process, on the CPU unless UNIFUSION_DEVICE says otherwise."""
+    return uf.init(DEVICE)
+
+
+@pytest.fixture(scope="session")
+def data() -> Callable[[str], Path]:
+    """Folder of a named recording, or a skip that says where it was looked for."""
+    def folder(name: str) -> Path:
+        if not (DATA / name).is_dir():
+            pytest.skip(f"no {name} in {DATA}; set UNIFUSION_DATA to a folder that has it")
+        return DATA / name
+
+    return folder

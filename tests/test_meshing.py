@@ -1,0 +1,245 @@
+"""Marching cubes: the tables, the kernels against their twins, and what every mesh must be."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+import reference
+from skimage.measure import marching_cubes
+
+from taichi_unifusion import meshing
+from taichi_unifusion.errors import InputError
+from taichi_unifusion.kernels import marching_cubes as kernels
+from taichi_unifusion.maps import SurfaceMap
+
+R = 4                  # samples a cube edge in these tests
+VS = 0.05
+ALL = 0xFFFFFFFF       # support everywhere
+ROUNDING = 1e-6        # [m] float32 positions of a few voxels
+AREA = 0.002           # relative: other triangulations of the same crossings of a smooth field
+
+
+def cubes_of(field: np.ndarray, first=(0, 0, 0), keep=None):
+    """Cubes (keys, upper, samples) that carry a field (n R)^3 on the lattice, without those that `keep` (n, n, n) leaves out."""
+    n = len(field) // R
+    places = np.array([q for q in product(range(n), repeat=3) if keep is None or keep[q]])
+    samples = [field[tuple(slice(R * i, R * i + R) for i in q)].reshape(-1) for q in places]
+    keys = (places + first).astype(np.int32)
+    return keys, meshing._upper_cubes(keys), np.ascontiguousarray(samples, np.float32)
+
+
+def march(field: np.ndarray, first=(0, 0, 0)):
+    keys, upper, samples = cubes_of(field, first)
+    return meshing._march(keys, upper, np.full((len(keys), 2), ALL, np.uint32), samples, R, VS)
+
+
+def edge_counts(faces) -> tuple[np.ndarray, np.ndarray]:
+    """How many faces use each undirected edge, and how many each directed one."""
+    directed = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return (np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)[1],
+            np.unique(directed, axis=0, return_counts=True)[1])
+
+
+def assert_welded(vertices, faces) -> None:
+    """No unreferenced vertices, none twice, no face with two equal corners."""
+    assert faces.min() == 0 and len(np.unique(faces)) == len(vertices) == faces.max() + 1
+    assert (faces[:, 0] != faces[:, 1]).all() and (faces[:, 1] != faces[:, 2]).all() and (faces[:, 2] != faces[:, 0]).all()
+
+
+def assert_closed(vertices, faces) -> None:
+    """Every edge lies in an even number of faces, each time in either direction: a closed, oriented surface."""
+    assert_welded(vertices, faces)
+    undirected, directed = edge_counts(faces)
+    assert (undirected % 2 == 0).all() and (directed == undirected.max() // 2).all() if undirected.max() == 2 else True
+    forward = {}
+    for a, b in np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist():
+        forward[a, b] = forward.get((a, b), 0) + 1
+    assert all(forward.get((b, a), 0) == count for (a, b), count in forward.items())
+
+
+def area_and_volume(vertices, faces) -> tuple[float, float]:
+    a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, np.einsum("ni,ni->", a, np.cross(b, c)) / 6
+
+
+# ---- Tables ----
+
+def triangles_of(case: int) -> np.ndarray:
+    counts, _, table, _ = meshing.marching_cubes_tables()
+    return table[case, :3 * counts[case]].reshape(-1, 3)
+
+
+def ends(e: int) -> tuple[int, int]:
+    """Corner numbers of a cell edge."""
+    *low, axis = meshing.marching_cubes_tables()[3][e].tolist()
+    lower = low[0] * 4 + low[1] * 2 + low[2]
+    return lower, lower | 4 >> axis
+
+
+@pytest.mark.parametrize("case", range(256))
+def test_every_case_is_a_disc_bounded_by_the_cells_faces(case):
+    """Vertices on exactly the crossed edges; inner edges shared twice, in both directions; the border lies in the cell's faces."""
+    triangles, flags = triangles_of(case), meshing.marching_cubes_tables()[1][case]
+    crossed = {e for e in range(12) if (case >> ends(e)[0] & 1) != (case >> ends(e)[1] & 1)}
+    assert set(triangles.flatten().tolist()) == crossed == {e for e in range(12) if flags >> e & 1}
+    directed = [tuple(t[[k, (k + 1) % 3]].tolist()) for t in triangles for k in range(3)]
+    assert len(set(directed)) == len(directed)
+    border = [(a, b) for a, b in directed if (b, a) not in directed]
+    assert len(border) == reference.emit_triangles(case)
+    assert sorted(a for a, _ in border) == sorted(b for _, b in border) == sorted(crossed)
+    for a, b in border:
+        corners = [meshing.STEPS[c] for c in (*ends(a), *ends(b))]
+        assert any(len({corner[d] for corner in corners}) == 1 for d in range(3))
+
+
+def test_complements_have_as_many_crossed_edges_and_single_corners_one_triangle():
+    counts, flags, _, _ = meshing.marching_cubes_tables()
+    np.testing.assert_array_equal(flags, flags[::-1])
+    assert counts[0] == counts[255] == 0 and counts.max() <= 5
+    assert all(counts[1 << o] == 1 and counts[255 - (1 << o)] == 1 for o in range(8))
+
+
+@pytest.mark.parametrize("case", range(1, 255))
+def test_triangles_are_counter_clockwise_seen_from_in_front(case):
+    """The area vector of a case points from the corners behind towards those in front."""
+    middles = np.array([np.mean([meshing.STEPS[c] for c in ends(e)], axis=0) for e in range(12)])
+    a, b, c = np.moveaxis(middles[triangles_of(case)], 1, 0)
+    behind = np.array([case >> o & 1 for o in range(8)], bool)
+    forward = np.mean([meshing.STEPS[o] for o in np.flatnonzero(~behind)], axis=0) - np.mean(
+        [meshing.STEPS[o] for o in np.flatnonzero(behind)], axis=0)
+    area = np.cross(b - a, c - a).sum(axis=0)
+    assert area @ forward > 0 or np.allclose(forward, 0) or np.allclose(area, 0)
+
+
+# ---- Kernels against their twins ----
+
+@pytest.fixture(scope="module")
+def patchy():
+    """2^3 cubes of random samples, one cube missing, some samples unknown, some cells unsupported."""
+    rng = np.random.default_rng(3)
+    field = rng.normal(size=(2 * R,) * 3).astype(np.float32)
+    field[rng.uniform(size=field.shape) < 0.03] = reference.UNKNOWN
+    keep = np.ones((2, 2, 2), bool)
+    keep[1, 0, 1] = False
+    keys, upper, samples = cubes_of(field, (-1, 5, 0), keep)
+    support = rng.integers(0, 2**32, (len(keys), 2), dtype=np.uint32) | rng.integers(0, 2**32, (len(keys), 2), dtype=np.uint32)
+    whole = np.full((2 * R + 1,) * 3, reference.UNKNOWN)
+    whole[:-1, :-1, :-1] = field
+    whole[R:2 * R, :R, R:2 * R] = reference.UNKNOWN
+    return keys, upper, samples, support, whole
+
+
+def twin_cases(patchy) -> np.ndarray:
+    keys, _, _, support, whole = patchy
+    cases = np.zeros((2 * R,) * 3, int)
+    for key, mask in zip(keys - (-1, 5, 0), reference.unpack_masks(support), strict=True):
+        block = tuple(slice(R * k, R * k + R + 1) for k in key)
+        cases[tuple(slice(R * k, R * k + R) for k in key)] = reference.classify_cells(whole[block], mask.reshape(4, 4, 4), R)
+    return cases
+
+
+def classified(patchy):
+    keys, upper, samples, support, _ = patchy
+    counts, flags, table, edge_table = meshing.marching_cubes_tables()
+    cases, edges, triangles = np.empty(samples.shape, np.uint8), np.zeros(samples.shape, np.int32), np.empty(len(keys), np.int32)
+    kernels.classify_cells(R, upper, support, samples, counts, edge_table, flags, cases, edges, triangles)
+    return cases, edges, triangles
+
+
+def lattice(patchy, values) -> np.ndarray:
+    """(Q, R^3) by cube -> (2 R)^3."""
+    whole = np.zeros((2 * R,) * 3, values.dtype)
+    for key, block in zip(patchy[0] - (-1, 5, 0), values, strict=True):
+        whole[tuple(slice(R * k, R * k + R) for k in key)] = block.reshape(R, R, R)
+    return whole
+
+
+def test_classify_cells_and_count_vertices_equal_their_twins(patchy):
+    cases, edges, triangles = classified(patchy)
+    twin = twin_cases(patchy)
+    np.testing.assert_array_equal(lattice(patchy, cases), twin)
+    assert len(np.unique(twin)) > 50
+    crossed = reference.crossed_edges(twin)
+    assert {(*at, d) for d in range(3) for at in map(tuple, np.argwhere(lattice(patchy, edges) >> d & 1).tolist())} == crossed
+    np.testing.assert_array_equal(triangles, meshing.marching_cubes_tables()[0][cases].sum(axis=1))
+    vertices = np.empty(len(cases), np.int32)
+    kernels.count_vertices(edges, vertices)
+    assert vertices.sum() == len(crossed)
+    np.testing.assert_array_equal(vertices, sum((edges >> d & 1).sum(axis=1) for d in range(3)))
+
+
+def test_place_vertices_and_emit_triangles_equal_their_twins(patchy):
+    """One vertex on every crossed edge, where the field is zero; every cell's triangles join the vertices of its own edges."""
+    keys, upper, samples, support, whole = patchy
+    vertices, faces = meshing._march(keys, upper, support, samples, R, VS)
+    cases = twin_cases(patchy)
+    place = {edge: reference.place_vertices(whole, edge, R, np.array([-1, 5, 0]), VS) for edge in reference.crossed_edges(cases)}
+    found = sorted(map(tuple, vertices.astype(float).tolist()))
+    np.testing.assert_allclose(found, sorted(map(tuple, np.array(list(place.values())).tolist())), atol=ROUNDING)
+    edge_table, wanted = meshing.marching_cubes_tables()[3], []
+    for cell in np.argwhere(cases):
+        for triangle in triangles_of(cases[tuple(cell)]):
+            wanted.append(np.concatenate([place[(*(cell + edge_table[e, :3]).tolist(), int(edge_table[e, 3]))] for e in triangle]))
+    wanted, emitted = np.array(wanted), vertices[faces].reshape(-1, 9)
+    assert wanted.shape == emitted.shape
+    nearest = np.abs(wanted[:, None] - emitted[None]).max(axis=2).argmin(axis=1)
+    assert len(np.unique(nearest)) == len(wanted)
+    np.testing.assert_allclose(emitted[nearest], wanted, atol=ROUNDING)
+
+
+def test_sum_normals_equals_its_twin(patchy):
+    keys, upper, samples, support, _ = patchy
+    vertices, faces = meshing._march(keys, upper, support, samples, R, VS)
+    sums, per_area = np.zeros((len(vertices), 3), np.int32), meshing.NORMAL_UNIT * (R / VS) ** 2
+    kernels.sum_normals(vertices, faces, per_area, sums)
+    np.testing.assert_allclose(sums / per_area, reference.sum_normals(vertices.astype(float), faces), atol=1e-4 * (VS / R) ** 2)
+
+
+# ---- Meshes ----
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_fields_give_closed_surfaces(seed):
+    """Noise at every sample, all ambiguous cases included, outside of the surface all around."""
+    field = np.random.default_rng(seed).normal(size=(3 * R,) * 3)
+    for axis in range(3):
+        field[tuple(slice(None) if a != axis else [0, 1, -2, -1] for a in range(3))] = 1.0
+    vertices, faces = march(field)
+    assert len(faces) > 1000
+    assert_closed(vertices, faces)
+    assert area_and_volume(vertices, faces)[1] > 0  # normals out of what is behind the surface
+
+
+@pytest.mark.parametrize("first", [(0, 0, 0), (-2, -3, 1)])
+def test_smooth_fields_agree_with_scikit_image(first):
+    x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5 * R)] * 3, indexing="ij"), axis=-1)
+    field = np.linalg.norm(x * (1, 1.3, 1.6), axis=-1) - 0.7 + 0.1 * np.sin(5 * x[..., 0])
+    vertices, faces = march(field, first)
+    assert_closed(vertices, faces)
+    theirs, their_faces, *_ = marching_cubes(field.astype(np.float32), 0.0, spacing=[VS / R] * 3)
+    theirs = theirs + (np.array(first) - 0.5) * VS
+    assert len(theirs) == len(vertices)
+    np.testing.assert_allclose(np.sort(vertices, axis=0), np.sort(theirs, axis=0), atol=5 * ROUNDING)
+    ours = area_and_volume(vertices, faces)
+    area, volume = area_and_volume(theirs, their_faces)
+    assert ours[0] == pytest.approx(area, rel=AREA) and ours[1] == pytest.approx(abs(volume), rel=AREA)
+
+
+def test_upper_cubes_are_found_by_key():
+    keys = meshing.unique_rows(np.random.default_rng(0).integers(-3, 3, (60, 3)) + (8000, -8000, 0))
+    rows = {key: n for n, key in enumerate(map(tuple, keys.tolist()))}
+    assert sorted(rows) == list(rows)
+    np.testing.assert_array_equal(meshing._upper_cubes(keys), [[rows.get(tuple((key + step).tolist()), -1) for step in meshing.STEPS]
+                                                               for key in keys])
+
+
+def test_an_empty_map_has_an_empty_mesh():
+    mesh = SurfaceMap().extract_mesh()
+    assert mesh.vertices.shape == mesh.faces.shape == mesh.normals.shape == (0, 3)
+
+
+@pytest.mark.parametrize("resolution", [0, 33, -1])
+def test_resolutions_out_of_range_are_refused(resolution):
+    with pytest.raises(InputError, match="resolution must lie in 1..32"):
+        SurfaceMap().extract_mesh(resolution)
