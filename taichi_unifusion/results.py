@@ -52,7 +52,7 @@ class ResultsFolder:
             self.failures.append(error)
         except Exception as error:  # whatever it is, it must not cost the other files
             logger.debug("%s", what, exc_info=True)
-            self.failures.append(FileError(f"{what} ({type(error).__name__}: {error})"))
+            self.failures.append(FileError(f"{what} ({type(error).__name__}: {' '.join(str(error).split())[:200]})"))
         return None
 
     def remove(self, name: str) -> None:

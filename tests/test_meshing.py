@@ -35,13 +35,6 @@ def march(field: np.ndarray, first=(0, 0, 0)):
     return meshing._march(keys, upper, np.full((len(keys), 2), ALL, np.uint32), samples, R, VS)
 
 
-def edge_counts(faces) -> tuple[np.ndarray, np.ndarray]:
-    """How many faces use each undirected edge, and how many each directed one."""
-    directed = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return (np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)[1],
-            np.unique(directed, axis=0, return_counts=True)[1])
-
-
 def assert_welded(vertices, faces) -> None:
     """No unreferenced vertices, none twice, no face with two equal corners."""
     assert faces.min() == 0 and len(np.unique(faces)) == len(vertices) == faces.max() + 1
@@ -49,14 +42,11 @@ def assert_welded(vertices, faces) -> None:
 
 
 def assert_closed(vertices, faces) -> None:
-    """Every edge lies in an even number of faces, each time in either direction: a closed, oriented surface."""
+    """Every edge is used exactly once in either direction: a closed, oriented manifold."""
     assert_welded(vertices, faces)
-    undirected, directed = edge_counts(faces)
-    assert (undirected % 2 == 0).all() and (directed == undirected.max() // 2).all() if undirected.max() == 2 else True
-    forward = {}
-    for a, b in np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist():
-        forward[a, b] = forward.get((a, b), 0) + 1
-    assert all(forward.get((b, a), 0) == count for (a, b), count in forward.items())
+    directed = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = set(map(tuple, directed.tolist()))
+    assert len(edges) == len(directed) and all((b, a) in edges for a, b in edges)
 
 
 def area_and_volume(vertices, faces) -> tuple[float, float]:

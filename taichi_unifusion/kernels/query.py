@@ -8,6 +8,37 @@ from .voxels import CELLS, INDEX_HALF, Floats1, Floats2, Floats3, Ints2, Masks2,
 UNKNOWN = 1e9  # signed distance where no voxel reaches
 
 
+@ti.func
+def decode(
+    rank: ti.template(), channels: ti.template(), centered: ti.template(), s: ti.i32, t: ti.template(),
+    latents: ti.template(), anchors: ti.template(), projection: ti.template(), scale: ti.f32,
+):
+    """f_dec(t, F) of the voxel in slot s, plus its prior mean (Eq. 7)."""
+    f = position_features(t, rank, anchors, projection, scale)
+    values = ti.Vector([0.0] * channels)
+    for c in ti.static(range(channels)):
+        value = latents[s, rank, c] if ti.static(centered) else 0.0
+        for a in ti.static(range(rank)):
+            value += f[a] * latents[s, a, c]
+        values[c] = value
+    return values
+
+
+@ti.func
+def nearest_voxel(x: ti.template(), reach: ti.i32, slot: ti.template()):
+    """Slot of the voxel whose centre is nearest to x within `reach` voxels along each axis, or -1, and its index."""
+    home = voxel_of(x)
+    found, at, nearest = -1, home, 1e9
+    for o in range((2 * reach + 1) ** 3):
+        edge = 2 * reach + 1
+        ijk = home + ti.Vector([o // (edge * edge), o // edge % edge, o % edge]) - reach
+        s = slot[ijk + INDEX_HALF] - 1
+        distance = (x - ijk - 0.5).norm_sqr()
+        if s >= 0 and distance < nearest:
+            found, at, nearest = s, ijk, distance
+    return found, at
+
+
 @ti.kernel
 def query_points(
     # in:
@@ -18,15 +49,16 @@ def query_points(
     slot: ti.template(),
     latents: Floats3,       # (S, l [+ 1], c)
     anchors: Floats2, projection: Floats2, scale: ti.f32,
+    reach: ti.i32,          # points that no voxel covers take the value of the nearest one within so many voxels
     # out:
-    values: Floats2,        # (N, c) 0 where not valid
-    valid: ti.types.ndarray(dtype=ti.u8, ndim=1),  # (N,)
+    values: Floats2,        # (N, c) 0 where there is none
+    valid: ti.types.ndarray(dtype=ti.u8, ndim=1),  # (N,) = 1 where a voxel covers the point
 ):
     for n in range(points.shape[0]):
         x = row3(points, n) * per_meter
         total = ti.Vector([0.0] * channels)
         weight = 0.0
-        if all_within(x, INDEX_HALF - 2.0):
+        if all_within(x, INDEX_HALF - 8.0):
             corner = voxel_of(x - 0.5) if ti.static(blend) else voxel_of(x)
             for o in range(8 if ti.static(blend) else 1):
                 ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
@@ -37,14 +69,15 @@ def query_points(
                     if ti.static(blend):
                         for d in ti.static(range(3)):
                             tent *= ti.max(1.0 - 2.0 * ti.abs(t[d]), 1e-6)
-                    f = position_features(t, rank, anchors, projection, scale)
-                    for c in ti.static(range(channels)):
-                        value = latents[s, rank, c] if ti.static(centered) else 0.0
-                        for a in ti.static(range(rank)):
-                            value += f[a] * latents[s, a, c]
-                        total[c] += tent * value
+                    total += tent * decode(rank, channels, centered, s, t, latents, anchors, projection, scale)
                     weight += tent
-        valid[n] = ti.cast(weight > 0, ti.u8)
+            valid[n] = ti.cast(weight > 0, ti.u8)
+            if weight == 0 and reach > 0:
+                s, ijk = nearest_voxel(x, reach, slot)
+                if s >= 0:
+                    t = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
+                    total = decode(rank, channels, centered, s, t, latents, anchors, projection, scale)
+                    weight = 1.0
         for c in ti.static(range(channels)):
             values[n, c] = total[c] / ti.max(weight, 1e-12)
 

@@ -15,6 +15,8 @@ from .base_map import BaseMap
 from .frame_blocks import FrameBlocks
 from .settings import PropertySettings
 
+NEAREST_REACH = 2  # voxels
+
 
 class PropertyMap(BaseMap):
     """A continuous field of `channels` values on the surface, fused from the attribute `name` of point clouds.
@@ -61,7 +63,10 @@ class PropertyMap(BaseMap):
         return self._cells
 
     def query(self, points: NDArray, return_valid: bool = False):
-        """Property values (N, c) float32 at points (N, 3) world [m], 0 where no voxel reaches; optionally also that mask (N,)."""
+        """Property values (N, c) float32 at points (N, 3) world [m]; optionally also where (N,) a voxel covers the point.
+
+        Elsewhere the value is that of the nearest voxel within two, so that a mesh has no black rims, and 0 beyond.
+        """
         runtime.check_alive(self._grid.runtime)
-        values, valid = self._regressor.query(points, blend=self.settings.blend)
+        values, valid = self._regressor.query(points, blend=self.settings.blend, reach=NEAREST_REACH)
         return (values, valid) if return_valid else values

@@ -78,15 +78,15 @@ class Regressor:
                               self.anchors, self.projection, self.scale, self.min_points, self.noise, self.workers, self.stride,
                               self.tiles, self.latents, self.weights)
 
-    def query(self, points: NDArray, blend: bool) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Decoded values (N, c) and where they are valid (N,), at points (N, 3) world [m] (Eq. 7)."""
+    def query(self, points: NDArray, blend: bool, reach: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Decoded values (N, c) and where a voxel covers (N,) the points (N, 3) world [m] (Eq. 7); `reach` as the kernel has it."""
         points = np.ascontiguousarray(points, dtype=np.float32)
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"query: points must be (N, 3), got {points.shape}")
         values, valid = np.zeros((len(points), self.channels), np.float32), np.zeros(len(points), np.uint8)
         if len(points):
             query.query_points(self.rank, self.channels, self.centered, blend, points, 1.0 / self.voxel_size, self.grid.slot,
-                               self.grid.latents, self.anchors, self.projection, self.scale, values, valid)
+                               self.grid.latents, self.anchors, self.projection, self.scale, reach, values, valid)
         return values, valid.astype(bool)
 
     def fuse(self, blocks: FrameBlocks) -> int:

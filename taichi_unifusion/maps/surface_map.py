@@ -75,7 +75,7 @@ class SurfaceMap(BaseMap):
     def sdf(self, points: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Signed distance (N,) [m] at points (N, 3) world [m], positive in front of the surface, and where it is known (N,)."""
         runtime.check_alive(self._grid.runtime)
-        values, valid = self._regressor.query(points, blend=True)
+        values, valid = self._regressor.query(points, blend=True, reach=0)
         return values[:, 0] * np.float32(self.voxel_size), valid
 
     def extract_mesh(self, resolution: int = 4) -> Mesh:
