@@ -258,8 +258,30 @@ def fuse(frames):
 
 # ---- Decoding: Eq. 7 ----
 
-def query_points(encoder, voxels, x, *, blend, centered=False):
-    """Values (N, c) and validity (N,): tent-blended over the doubled voxels that contain a point, or from its own voxel only."""
+def find_neighbors(keys):
+    """(B, 27) row of each neighbour of every key, -1 where there is none."""
+    rows = {tuple(key): n for n, key in enumerate(np.asarray(keys).tolist())}
+    return np.array([[rows.get(tuple((key + step).tolist()), -1) for step in product((-1, 0, 1), repeat=3)] for key in np.asarray(keys)])
+
+
+def decode(encoder, voxel, t, centered):
+    """f_dec(t, F), plus the prior mean."""
+    value = (encoder(t[None]) @ voxel.F[:encoder.rank])[0]
+    return value + voxel.F[encoder.rank] if centered else value
+
+
+def nearest_voxel(voxels, point, reach):
+    """Key of the voxel with the nearest centre among those up to `reach` voxels away along every axis, or None."""
+    home = np.floor(point).astype(int)
+    near = [key for key in voxels if np.abs(np.array(key) - home).max() <= reach]
+    return min(near, key=lambda key: np.linalg.norm(point - np.array(key) - 0.5), default=None)
+
+
+def query_points(encoder, voxels, x, *, blend, centered=False, reach=0):
+    """Values (N, c) and validity (N,): tent-blended over the doubled voxels that contain a point, or from its own voxel only.
+
+    Where there is none, the value is that of the nearest voxel within `reach` (0: none) at the nearest point of its doubled box.
+    """
     channels = next(iter(voxels.values())).F.shape[1]
     values, valid = np.zeros((len(x), channels)), np.zeros(len(x), bool)
     for n, point in enumerate(x):
@@ -270,11 +292,12 @@ def query_points(encoder, voxels, x, *, blend, centered=False):
             if voxel is not None:
                 t = (point - key - 0.5) / 2
                 tent = np.prod(1 - np.abs(2 * t)) if blend else 1.0
-                decoded = (encoder(t[None]) @ voxel.F[:encoder.rank])[0]
-                total += tent * (decoded + voxel.F[encoder.rank] if centered else decoded)
+                total += tent * decode(encoder, voxel, t, centered)
                 weight += tent
         if weight > 0:
             values[n], valid[n] = total / weight, True
+        elif reach and (key := nearest_voxel(voxels, point, reach)):
+            values[n] = decode(encoder, voxels[key], np.clip((point - np.array(key) - 0.5) / 2, -0.5, 0.5), centered)
     return values, valid
 
 

@@ -12,6 +12,7 @@ from scenes import moved, rough, taken
 from taichi_unifusion import runtime
 from taichi_unifusion.errors import CapacityError, OutOfRange, RuntimeStateError
 from taichi_unifusion.kernels import voxels as kernels
+from taichi_unifusion.kernels.regression import find_neighbors
 from taichi_unifusion.maps import voxel_grid
 from taichi_unifusion.maps.frame_blocks import FrameBlocks
 from taichi_unifusion.maps.voxel_grid import VoxelGrid
@@ -57,6 +58,17 @@ def test_touch_points_equals_its_twin(grid, cloud):
         keys = keys_of(blocks)
         assert len(set(keys)) == len(keys) and set(keys) == reference.touch_points(in_voxels(part.points))
     assert min(min(key) for key in keys_of(blocks)) < 0
+
+
+def test_find_neighbors_equals_its_twin(grid, cloud):
+    blocks = FrameBlocks(grid, 3, with_positions=True)
+    blocks.touch(cloud.points, VS)
+    blocks.touch(taken(cloud, slice(400)).points, VS)  # neighbours of the frame before do not count
+    found = np.empty((blocks.count, 27), np.int32)
+    find_neighbors(grid.stamp, grid.block, blocks.frame, blocks.count, blocks.keys, found)
+    twin = reference.find_neighbors(keys_of(blocks))
+    np.testing.assert_array_equal(found, twin)
+    assert 0.2 < (twin >= 0).mean() < 0.8 and (twin[:, 13] == np.arange(blocks.count)).all()
 
 
 def test_block_of_points_equals_its_twin(grid, cloud):

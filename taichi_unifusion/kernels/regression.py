@@ -18,14 +18,27 @@ TILE = 128  # samples whose features are held at once: the products run over thi
 
 
 @ti.func
-def neighbor_block(ijk: ti.template(), o: ti.i32, frame: ti.i32, stamp: ti.template(), block: ti.template()):
-    """Block number of neighbour o of 0..26 of voxel ijk, or -1, and its step (-1, 0, 1) per axis."""
-    step = ti.Vector([o // 9 - 1, o // 3 % 3 - 1, o % 3 - 1])
-    at = ti.math.clamp(ijk + step, -INDEX_HALF, INDEX_HALF - 1) + INDEX_HALF
-    found = -1
-    if stamp[at] == frame:
-        found = block[at]
-    return found, step
+def neighbor_step(o: ti.i32):
+    """Step (-1, 0, 1) per axis to neighbour o of 0..26."""
+    return ti.Vector([o // 9 - 1, o // 3 % 3 - 1, o % 3 - 1])
+
+
+@ti.kernel
+def find_neighbors(
+    # in:
+    stamp: ti.template(), block: ti.template(), frame: ti.i32,
+    blocks: ti.i32,
+    keys: Ints2,       # (B, 3)
+    # out:
+    neighbors: Ints2,  # (B, 27) block number of each neighbour, -1 where this frame does not touch it
+):
+    for b in range(blocks):
+        for o in range(27):
+            at = ti.math.clamp(row3(keys, b) + neighbor_step(o), -INDEX_HALF, INDEX_HALF - 1) + INDEX_HALF
+            found = -1
+            if stamp[at] == frame:
+                found = block[at]
+            neighbors[b, o] = found
 
 
 @ti.func
@@ -134,9 +147,8 @@ def encode_cells(
     # in:
     rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
     derivatives: ti.template(),
-    stamp: ti.template(), block: ti.template(), frame: ti.i32,
     blocks: ti.i32,
-    keys: Ints2,         # (B, 3)
+    neighbors: Ints2,    # (B, 27)
     masks: Masks2,       # (B, 2) occupied cells
     window: Masks2,      # (27, 2) cells of each neighbour that count
     totals: Ints1,       # (B,) points in the block itself
@@ -160,10 +172,9 @@ def encode_cells(
                 if totals[v] >= minimum:
                     G = ti.Vector([0.0] * (rows * size))
                     mean = ti.Vector([0.0] * channels)
-                    ijk = row3(keys, v)
                     filled, weight = 0, 0.0
                     for o in range(27):
-                        b, step = neighbor_block(ijk, o, frame, stamp, block)
+                        b, step = neighbors[v, o], neighbor_step(o)
                         if b >= 0:
                             first = starts[b]
                             for half in range(2):
@@ -205,9 +216,9 @@ def encode_points(
     # in:
     rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
     derivatives: ti.template(),
-    stamp: ti.template(), block: ti.template(), frame: ti.i32,
     blocks: ti.i32,
     keys: Ints2,          # (B, 3)
+    neighbors: Ints2,     # (B, 27)
     starts: Ints1,        # (B + 1,) first sample of each block
     samples: Floats2,     # (N, 3) [voxels], sorted by block
     targets: Floats2,     # (N, c [+ 3]) targets, and normals if `derivatives`
@@ -233,7 +244,7 @@ def encode_points(
                 ijk = row3(keys, v)
                 filled, weight = 0, 0.0
                 for o in range(27):
-                    b, step = neighbor_block(ijk, o, frame, stamp, block)
+                    b = neighbors[v, o]
                     if b >= 0:
                         for n in range(starts[b], starts[b + 1]):
                             t = (row3(samples, n) - ijk - 0.5) * 0.5
@@ -282,7 +293,7 @@ def fuse(
         s = slots[v]
         if s >= 0:
             old, new = map_weights[s], weights[v]
-            share = new / (old + new)
+            share = new / (old + new) if old > 0 else 1.0  # exactly, so that a loaded map equals the saved one
             for a in range(rows):
                 old_row = ti.Vector([map_latents[s, a, c] for c in ti.static(range(channels))])  # all reads before all writes
                 new_row = ti.Vector([latents[v, a, c] for c in ti.static(range(channels))])

@@ -326,12 +326,12 @@ def claim_slots(
         if weights[b] > 0:
             ijk = row3(keys, b)
             at = ijk + INDEX_HALF
-            if slot[at] == 0:  # slots are stored plus one: an absent voxel reads 0
-                fresh = ti.atomic_add(counters[0], 1)
-                slot[at] = fresh + 1
+            found = slot[at] - 1  # slots are stored plus one: an absent voxel reads 0
+            if found < 0:
+                found = ti.atomic_add(counters[0], 1)
+                slot[at] = found + 1
                 for d in ti.static(range(3)):
-                    slot_keys[fresh, d] = ijk[d]
-            found = slot[at] - 1
+                    slot_keys[found, d] = ijk[d]
             ti.atomic_add(counters[1], 1)
         slots[b] = found
 

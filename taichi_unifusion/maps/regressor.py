@@ -40,10 +40,19 @@ class Regressor:
         self.workers, self.stride = (CPU_WORKERS, CPU_STRIDE) if on_cpu else (GPU_WORKERS, GPU_STRIDE)
         self.window = ti.ndarray(ti.u32, (27, 2))
         self.window.from_numpy(_window_masks(margin))
-        self.tiles = ti.field(ti.f32, (self.workers, self.rows, kernels.TILE))  # a field: its strides are known when compiling
+        self.tiles = self._shared_tiles()
+        self.neighbors = ti.ndarray(ti.i32, (1, 27))
         self.latents = ti.ndarray(ti.f32, (1, 1, 1))
         self.weights = ti.ndarray(ti.f32, (1,))
         self.slots = ti.ndarray(ti.i32, (1,))
+
+    def _shared_tiles(self):
+        """Scratch for the workers, one for all maps of a runtime; a field, because its strides are known when compiling."""
+        shape = (self.workers, self.rows, kernels.TILE)
+        scratch = self.grid.runtime.scratch
+        if shape not in scratch:
+            scratch[shape] = ti.field(ti.f32, shape)
+        return scratch[shape]
 
     def _cell_features(self) -> NDArray[np.float64]:
         """(8^3, 1 or 4, size): f_posi, and its gradient by voxel units, at the cell centres of a doubled voxel."""
@@ -54,27 +63,30 @@ class Regressor:
             table[:, 1:, :self.rank] = 0.5 * self.encoding.gradient(t)  # t moves by 1/2 a voxel
         return table
 
-    def _reserve(self, blocks: int) -> None:
-        if blocks > self.weights.shape[0]:
-            room = blocks * 5 // 4
+    def _begin(self, blocks: FrameBlocks) -> None:
+        """Make room for the results of a frame and look up the neighbours of its blocks."""
+        if blocks.count > self.weights.shape[0]:
+            room = blocks.count * 5 // 4
+            self.neighbors = ti.ndarray(ti.i32, (room, 27))
             self.latents = ti.ndarray(ti.f32, (room, self.grid.rows, self.channels))
             self.weights = ti.ndarray(ti.f32, (room,))
             self.slots = ti.ndarray(ti.i32, (room,))
+        kernels.find_neighbors(self.grid.stamp, self.grid.block, blocks.frame, blocks.count, blocks.keys, self.neighbors)
 
     def encode_cells(self, blocks: FrameBlocks) -> None:
         """Encode from the blocks' compacted cells."""
-        self._reserve(blocks.count)
+        self._begin(blocks)
         kernels.encode_cells(self.rank, self.size, self.rows, self.channels, self.centered, self.derivatives,
-                             self.grid.stamp, self.grid.block, blocks.frame, blocks.count, blocks.keys, blocks.masks, self.window,
-                             blocks.totals, blocks.starts, blocks.cells, self.cell_features, self.min_points, self.noise, self.workers, self.stride,
+                             blocks.count, self.neighbors, blocks.masks, self.window, blocks.totals, blocks.starts, blocks.cells,
+                             self.cell_features, self.min_points, self.noise, self.workers, self.stride,
                              self.tiles, self.latents, self.weights)
 
     def encode_points(self, blocks: FrameBlocks, starts: NDArray[np.int32], samples: NDArray[np.float32],
                       targets: NDArray[np.float32]) -> None:
         """Encode from single samples (N, 3) [voxels] with targets (N, c), both sorted by block; block b has starts[b:b+2]."""
-        self._reserve(blocks.count)
+        self._begin(blocks)
         kernels.encode_points(self.rank, self.size, self.rows, self.channels, self.centered, self.derivatives,
-                              self.grid.stamp, self.grid.block, blocks.frame, blocks.count, blocks.keys, starts, samples, targets,
+                              blocks.count, blocks.keys, self.neighbors, starts, samples, targets,
                               self.anchors, self.projection, self.scale, self.min_points, self.noise, self.workers, self.stride,
                               self.tiles, self.latents, self.weights)
 

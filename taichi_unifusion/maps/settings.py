@@ -29,8 +29,8 @@ class MapSettings:
     def __post_init__(self) -> None:
         if not 1e-4 <= self.voxel_size <= 100:
             raise InputError(f"voxel_size: must lie between 0.0001 and 100 metres, got {self.voxel_size}")
-        if self.noise <= 0:
-            raise InputError(f"noise: must be positive, got {self.noise}")
+        if not 0 < self.noise < float("inf"):
+            raise InputError(f"noise: must be positive and finite, got {self.noise}")
         if self.min_points < 1:
             raise InputError(f"min_points: must be at least 1, got {self.min_points}")
         if self.margin not in (1, 2):
@@ -67,6 +67,10 @@ class PropertySettings(MapSettings):
 
     voxel_size: float = 0.02
     """Voxel edge in metres; a latent describes a cube of twice this edge."""
+    noise: float = 0.3
+    """Observation noise d of the regression (Eq. 18) relative to the kernel's variance; larger is smoother."""
+    encoder: EncoderSettings = field(default_factory=lambda: EncoderSettings(rank=12))
+    """The position encoding; 12 eigenpairs render as well as 20 here, and half the work."""
     prior: Literal["mean", "zero"] = "mean"
     """What the field falls back to where a voxel has no data: the voxel's mean, or zero as published."""
     blend: bool = True

@@ -1,0 +1,21 @@
+"""Every kernel of the method has a slow twin, and none is left untested."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import pytest
+import reference
+
+MODULES = ["encoding", "voxels", "regression", "query", "marching_cubes", "images"]
+# Bookkeeping with no twin but a dict or a sum, in the tests named here.
+BOOKKEEPING = {"claim_slots": "test_voxels", "gather_voxels": "test_voxels", "copy_voxels": "test_voxels",
+               "count_leaves": "test_voxels", "count_vertices": "test_meshing"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_kernel_has_a_twin_of_its_name(module):
+    loaded = import_module(f"taichi_unifusion.kernels.{module}")
+    kernels = {name for name, value in vars(loaded).items() if getattr(value, "_is_wrapped_kernel", False)}
+    assert kernels
+    assert {name for name in kernels if not hasattr(reference, name) and name not in BOOKKEEPING} == set()
