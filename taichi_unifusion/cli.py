@@ -19,7 +19,7 @@ from typing import Annotated, Literal, Union
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
-from .config import Config, dump_config, load_config
+from .config import Config, MeshSettings, dump_config, load_config
 from .datasets import FORMATS, Dataset, open_dataset
 from .errors import DatasetError, FileError, InputError, UniFusionError
 from .interrupts import INTERRUPTED, stop_on_signal
@@ -93,6 +93,8 @@ class ExtractMesh:
     """Results folder of `unifusion reconstruct`."""
     resolution: Annotated[int, arg(metavar="N")] = 4
     """Cells along the edge of a surface voxel; 8 gives 4 times the triangles of 4."""
+    min_area: Annotated[float, arg(metavar="M2")] = MeshSettings.min_area
+    """Connected parts of less than this area, in square metres, are left out; 0 keeps all."""
     out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: DIR/mesh.ply and DIR/mesh.glb)")] = None
     """Where to write it: .ply, .glb or .obj."""
     device: Literal["auto", "cuda", "cpu"] = "auto"
@@ -180,7 +182,7 @@ def extract_mesh(options: ExtractMesh) -> int:
     runtime.init(options.device)
     surface = SurfaceMap.load(maps.pop("surface"))
     properties = {name: PropertyMap.load(path) for name, path in maps.items()}
-    mesh = pipeline.extract_mesh(surface, properties, options.resolution)
+    mesh = pipeline.extract_mesh(surface, properties, options.resolution, options.min_area)
     failures = []
     for file in files:
         try:

@@ -41,6 +41,24 @@ def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float,
     return Mesh(vertices, faces, normals.astype(np.float32))
 
 
+def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
+    """The mesh without connected parts of less than `min_area` square metres: mostly stray readings."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if min_area <= 0 or not len(mesh.faces):
+        return mesh
+    a, b, c = mesh.faces.T
+    links = coo_array((np.ones(2 * len(a), np.int8), (np.concatenate([a, b]), np.concatenate([b, c]))), (len(mesh.vertices),) * 2)
+    part = connected_components(links, directed=False)[1]
+    corners = mesh.vertices[mesh.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    kept = np.bincount(part[a], areas)[part] >= min_area                    # (V,)
+    renumber = (np.cumsum(kept) - 1).astype(np.int32)
+    return Mesh(mesh.vertices[kept], renumber[mesh.faces[kept[a]]], None if mesh.normals is None else mesh.normals[kept],
+                {name: values[kept] for name, values in mesh.attributes.items()})
+
+
 def _cubes(grid: VoxelGrid, support_reach: int) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
     """Sorted keys (Q, 3) of the cubes that hold surface or close one that does, and their support masks (Q, 2)."""
     data = grid.export()

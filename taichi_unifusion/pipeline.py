@@ -89,12 +89,13 @@ class Pipeline:
 
     def extract_mesh(self, resolution: int | None = None) -> Mesh:
         """The mesh of all that was fused so far, coloured; `resolution` overrides the configuration's."""
-        return extract_mesh(self.surface, self.properties, self.config.mesh.resolution if resolution is None else resolution)
+        mesh = self.config.mesh
+        return extract_mesh(self.surface, self.properties, mesh.resolution if resolution is None else resolution, mesh.min_area)
 
 
-def extract_mesh(surface: SurfaceMap, properties: Mapping[str, PropertyMap], resolution: int) -> Mesh:
+def extract_mesh(surface: SurfaceMap, properties: Mapping[str, PropertyMap], resolution: int, min_area: float) -> Mesh:
     """The surface as a mesh that carries every property that has data."""
-    mesh = surface.extract_mesh(resolution)
+    mesh = surface.extract_mesh(resolution, min_area)
     for name, source in properties.items():
         if len(source) and len(mesh.vertices):
             mesh = mesh.with_attribute(name, source.query(mesh.vertices))

@@ -72,3 +72,17 @@ def test_the_attribute_must_be_there_and_fit(target):
         PropertyMap("rgb", 0)
     with pytest.raises(InputError, match="^prior: 'none' is unknown, choose one of mean, zero"):
         PropertyMap("rgb", 3, prior="none")
+
+
+def test_a_value_that_is_no_number_is_refused_or_left_out_never_spread():
+    """One NaN among the values of a frame must not reach any other point."""
+    cloud = colored(rectangle((0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), 0.004), RGB)
+    cloud.attributes["rgb"][500, 1] = np.nan
+    color = PropertyMap("rgb", 3)
+    try:
+        color.integrate(cloud)
+    except InputError:
+        assert len(color) == 0
+    else:
+        values, valid = color.query(cloud.points, return_valid=True)
+        assert valid.mean() > 0.9 and np.abs(values[valid] - RGB).max() < CONSTANT

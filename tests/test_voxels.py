@@ -20,7 +20,7 @@ from taichi_unifusion.maps.voxel_grid import VoxelGrid
 VS = 0.05
 FIXED = 1e-6      # 24 fractional bits, rounded once a run of points, and float32 sums within a run
 POSITION = 5e-6   # [voxels] float32 positions some voxels from the origin
-OFFSETS = np.array([-0.15, 0.0, 0.15], np.float32)
+OFFSETS = np.array([-0.1, 0.0, 0.2], np.float32)  # not symmetric, so that a wrong sign shows
 
 
 @pytest.fixture(scope="module")

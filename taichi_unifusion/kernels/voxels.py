@@ -254,28 +254,30 @@ def mark_cells(
     minimum: ti.i32,
     # out:
     masks: Masks2,    # (B, 2) bit 31-k of word j: cell 32 j + k holds a point
-    support: Masks2,  # (B, 2) the same, for at least `minimum` points; 0 sets all of a block with points
+    support: Masks2,  # (B, 2) the same, for at least `minimum` points, or half a sparse block's mean; 0 sets all
     totals: Ints1,    # (B,) points
     cells: Ints1,     # (B,) cells that hold points
 ):
     for b in range(blocks):
         total, occupied = 0, 0
         for half in ti.static(range(2)):
-            mask, enough = ti.u32(0), ti.u32(0)
+            mask = ti.u32(0)
             for k in range(32):
                 count = counts[b, half * 32 + k]
-                bit = ti.u32(1) << ti.cast(31 - k, ti.u32)
                 if count > 0:
-                    mask |= bit
+                    mask |= ti.u32(1) << ti.cast(31 - k, ti.u32)
                     total += count
                     occupied += 1
-                if count >= minimum:
-                    enough |= bit
-            masks[b, half], support[b, half] = mask, enough
-        if total == 0:
-            for half in ti.static(range(2)):
-                support[b, half] = ti.u32(0)
+            masks[b, half] = mask
         totals[b], cells[b] = total, occupied
+        for half in ti.static(range(2)):
+            enough = ti.u32(0)
+            if total > 0:
+                for k in range(32):
+                    count = counts[b, half * 32 + k]
+                    if count >= minimum or 2 * count * occupied >= total:
+                        enough |= ti.u32(1) << ti.cast(31 - k, ti.u32)
+            support[b, half] = enough
 
 
 @ti.kernel

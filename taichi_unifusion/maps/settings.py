@@ -46,8 +46,9 @@ class SurfaceSettings(MapSettings):
     """samples: points on and beside the surface carry signed distances; derivatives: points carry their normals (Eq. 14-17)."""
     sample_distance: float = 0.15
     """Distance of the off-surface samples along the normal, in voxels (d_s)."""
-    support_points: int = 3
-    """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one frame; 0: everywhere in voxels that did."""
+    support_points: int = 4
+    """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one frame (fewer where a whole voxel has
+    few); 0: everywhere in voxels that held any."""
 
     support_reach: int = 0
     """How many cells beyond seen cells surface may be extracted."""

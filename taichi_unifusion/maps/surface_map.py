@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import InputError
-from ..meshing import extract_mesh
+from ..meshing import drop_small_parts, extract_mesh
 from ..types import Mesh, PointCloud
 from .base_map import BaseMap
 from .frame_blocks import FrameBlocks
@@ -78,12 +78,15 @@ class SurfaceMap(BaseMap):
         values, valid = self._regressor.query(points, blend=True, reach=0)
         return values[:, 0] * np.float32(self.voxel_size), valid
 
-    def extract_mesh(self, resolution: int = 4) -> Mesh:
+    def extract_mesh(self, resolution: int = 4, min_area: float = 0.0) -> Mesh:
         """The zero level by marching cubes on `resolution`^3 cells a voxel; an empty mesh where nothing was integrated.
+
+        Connected parts of less than `min_area` square metres are left out.
 
         Raises InputError for a resolution outside 1..32.
         """
         runtime.check_alive(self._grid.runtime)
         if not 1 <= resolution <= 32:
             raise InputError(f"extract_mesh: resolution must lie in 1..32 cells a voxel, got {resolution}")
-        return extract_mesh(self._grid, self._regressor.encoding, self.voxel_size, resolution, self.settings.support_reach)
+        mesh = extract_mesh(self._grid, self._regressor.encoding, self.voxel_size, resolution, self.settings.support_reach)
+        return drop_small_parts(mesh, min_area)
