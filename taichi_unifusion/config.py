@@ -31,10 +31,10 @@ class MeshSettings:
 
     resolution: int = 4
     """Marching-cubes cells along the edge of a surface voxel; 8 gives 4 times the triangles of 4."""
-    min_area: float = 0.001
-    """Connected parts of less than this area, in square metres, are left out: mostly stray readings. 0 keeps all."""
     formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply", "glb")
     """Files to write the mesh to."""
+    min_area: float = 0.001
+    """Connected parts of less than this area, in square metres, are left out: mostly stray readings. 0 keeps all."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.resolution <= MAX_RESOLUTION:

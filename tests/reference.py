@@ -167,11 +167,12 @@ def bin_surfel_samples(x, normals, offsets):
 
 
 def mark_cells(counts, minimum):
-    """Voxel -> (64,) cells with at least `minimum` of the counts given by lattice cell; 0 marks all."""
-    masks = defaultdict(lambda: np.full(CELLS**3, minimum == 0))
+    """Voxel -> cells (64,) with `minimum` of the counts by lattice cell or half the mean of its occupied cells; 0 marks all."""
+    in_cells = defaultdict(lambda: np.zeros(CELLS**3))
     for cell, count in counts.items():
-        masks[tuple(c // CELLS for c in cell)][cell_number(cell)] = count >= minimum
-    return masks
+        in_cells[tuple(c // CELLS for c in cell)][cell_number(cell)] = count
+    masks = {key: (n >= minimum) | (n >= 0.5 * n[n > 0].mean()) for key, n in in_cells.items()}
+    return defaultdict(lambda: np.zeros(CELLS**3, bool), masks)
 
 
 def compact_cells(counts, sums):
@@ -228,7 +229,8 @@ def surface_frame(encoder, x, normals, settings):
     else:
         samples = np.vstack([x + a * normals for a in steps])
         targets = np.repeat(steps, len(x))[:, None]
-        local = encode_points(encoder, samples, targets, normals=np.tile(normals, (len(steps), 1)) if derivatives else None, **options)
+        slopes = np.tile(normals, (len(steps), 1)) if derivatives else None
+        local = encode_points(encoder, samples, targets, normals=slopes, **options)
         counts = {cell: len(n) for cell, n in rows_by(np.floor(samples * CELLS).astype(int)).items()}
     masks = mark_cells(counts, settings.support_points)
     return {key: Voxel(F, w, masks[key]) for key, (F, w) in local.items()}
@@ -261,7 +263,8 @@ def fuse(frames):
 def find_neighbors(keys):
     """(B, 27) row of each neighbour of every key, -1 where there is none."""
     rows = {tuple(key): n for n, key in enumerate(np.asarray(keys).tolist())}
-    return np.array([[rows.get(tuple((key + step).tolist()), -1) for step in product((-1, 0, 1), repeat=3)] for key in np.asarray(keys)])
+    steps = list(product((-1, 0, 1), repeat=3))
+    return np.array([[rows.get(tuple((key + step).tolist()), -1) for step in steps] for key in np.asarray(keys)])
 
 
 def decode(encoder, voxel, t, centered):
@@ -280,7 +283,7 @@ def nearest_voxel(voxels, point, reach):
 def query_points(encoder, voxels, x, *, blend, centered=False, reach=0):
     """Values (N, c) and validity (N,): tent-blended over the doubled voxels that contain a point, or from its own voxel only.
 
-    Where there is none, the value is that of the nearest voxel within `reach` (0: none) at the nearest point of its doubled box.
+    Elsewhere the value is that of the nearest voxel within `reach` (0: none), at the nearest point of its doubled box.
     """
     channels = next(iter(voxels.values())).F.shape[1]
     values, valid = np.zeros((len(x), channels)), np.zeros(len(x), bool)
@@ -302,8 +305,9 @@ def query_points(encoder, voxels, x, *, blend, centered=False, reach=0):
 
 
 def sdf_grid(encoder, voxels, corner, resolution):
-    """(R, R, R) signed distance at the samples of the cube that spans the centres of the eight voxels around a lattice corner."""
-    samples = corner - 0.5 + np.stack(np.meshgrid(*[np.arange(resolution) / resolution] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    """(R, R, R) signed distance at the samples of the cube that spans the centres of the eight voxels around a corner."""
+    axes = [np.arange(resolution) / resolution - 0.5] * 3
+    samples = corner + np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     values, valid = query_points(encoder, voxels, samples, blend=True)
     return np.where(valid, values[:, 0], UNKNOWN).reshape([resolution] * 3)
 
@@ -327,7 +331,7 @@ def corner_support(voxels, corner, reach):
 # ---- Marching cubes ----
 
 def classify_cells(field, support, resolution):
-    """Case (bit per corner behind the surface, x slowest) of every cell of a field (R+1, R+1, R+1); 0 where unknown or unsupported."""
+    """Case (bit per corner behind the surface, x slowest) of every cell of a field (R+1)^3; 0 where unknown or unsupported."""
     cases = np.zeros([resolution] * 3, int)
     for ijk in product(range(resolution), repeat=3):
         corners = [field[tuple(np.add(ijk, step))] for step in CORNERS]
@@ -357,7 +361,7 @@ def place_vertices(field, edge, resolution, corner, voxel_size):
 
 
 def emit_triangles(case):
-    """Number of edges on which the surface of a case begins or ends on the cell's faces: two ends a segment, so a closed border."""
+    """Number of segments in which the surface of a case meets the cell's faces: half the crossings of the faces' borders."""
     return sum((case >> cycle[k] & 1) != (case >> cycle[(k + 1) % 4] & 1) for cycle in FACE_CYCLES for k in range(4)) // 2
 
 

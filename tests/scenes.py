@@ -43,7 +43,7 @@ def box(half: float, spacing: float, center=(0, 0, 0)) -> PointCloud:
 
 
 def rough(seed: int, count: int = 1500, voxel_size: float = 0.05) -> PointCloud:
-    """Points scattered about a tilted plane some voxels wide, with unit normals up to some 30 degrees off, and random attributes."""
+    """Points scattered about a tilted plane some voxels wide, unit normals up to 30 degrees off, random attributes."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-2.2, 2.2, (count, 2))
     points = np.column_stack([xy, xy @ (0.3, -0.2) + rng.normal(0, 0.2, count) - 0.4]) * voxel_size

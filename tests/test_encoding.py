@@ -56,7 +56,7 @@ def test_kernel_error_is_small_and_falls_with_rank_and_anchors():
     assert PositionEncoding(EncoderSettings()).kernel_error() <= KERNEL_ERROR
     by_rank = [PositionEncoding(EncoderSettings(rank=rank)).kernel_error() for rank in (5, 10, 20, 40, 80)]
     assert all(after < 0.7 * before for before, after in zip(by_rank, by_rank[1:], strict=False)), by_rank
-    by_anchors = [np.mean([PositionEncoding(EncoderSettings(anchors=anchors, seed=seed)).kernel_error(500) for seed in range(3)])
+    by_anchors = [np.mean([PositionEncoding(EncoderSettings(anchors=anchors, seed=s)).kernel_error(500) for s in range(3)])
                   for anchors in (20, 64, 256)]
     assert all(after < before for before, after in zip(by_anchors, by_anchors[1:], strict=False)), by_anchors
 

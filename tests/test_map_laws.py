@@ -115,7 +115,8 @@ def test_M8_load_gives_identical_answers_and_files(kind, fused, tmp_path):
     if kind.name == "surface":
         ours, theirs = loaded.extract_mesh(3), fused.extract_mesh(3)
         assert len(ours.faces) > 0
-        assert all(getattr(ours, part).tobytes() == getattr(theirs, part).tobytes() for part in ("vertices", "faces", "normals"))
+        assert all(getattr(ours, part).tobytes() == getattr(theirs, part).tobytes()
+                   for part in ("vertices", "faces", "normals"))
 
 
 def test_N5_another_process_with_another_number_of_threads_writes_the_same_bytes(kind, fused, tmp_path):

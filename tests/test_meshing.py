@@ -22,7 +22,7 @@ AREA = 0.002           # relative: other triangulations of the same crossings of
 
 
 def cubes_of(field: np.ndarray, first=(0, 0, 0), keep=None):
-    """Cubes (keys, upper, samples) that carry a field (n R)^3 on the lattice, without those that `keep` (n, n, n) leaves out."""
+    """Cubes (keys, upper, samples) that carry a field (n R)^3 on the lattice, but those that `keep` (n, n, n) leaves out."""
     n = len(field) // R
     places = np.array([q for q in product(range(n), repeat=3) if keep is None or keep[q]])
     samples = [field[tuple(slice(R * i, R * i + R) for i in q)].reshape(-1) for q in places]
@@ -70,7 +70,7 @@ def ends(e: int) -> tuple[int, int]:
 
 @pytest.mark.parametrize("case", range(256))
 def test_every_case_is_a_disc_bounded_by_the_cells_faces(case):
-    """Vertices on exactly the crossed edges; inner edges shared twice, in both directions; the border lies in the cell's faces."""
+    """Vertices on exactly the crossed edges; inner edges shared twice, in both directions; the border in the cell's faces."""
     triangles, flags = triangles_of(case), meshing.marching_cubes_tables()[1][case]
     crossed = {e for e in range(12) if (case >> ends(e)[0] & 1) != (case >> ends(e)[1] & 1)}
     assert set(triangles.flatten().tolist()) == crossed == {e for e in range(12) if flags >> e & 1}
@@ -133,7 +133,8 @@ def twin_cases(patchy) -> np.ndarray:
 def classified(patchy):
     keys, upper, samples, support, _ = patchy
     counts, flags, table, edge_table = meshing.marching_cubes_tables()
-    cases, edges, triangles = np.empty(samples.shape, np.uint8), np.zeros(samples.shape, np.int32), np.empty(len(keys), np.int32)
+    cases, edges = np.empty(samples.shape, np.uint8), np.zeros(samples.shape, np.int32)
+    triangles = np.empty(len(keys), np.int32)
     kernels.classify_cells(R, upper, support, samples, counts, edge_table, flags, cases, edges, triangles)
     return cases, edges, triangles
 
@@ -165,13 +166,15 @@ def test_place_vertices_and_emit_triangles_equal_their_twins(patchy):
     keys, upper, samples, support, whole = patchy
     vertices, faces = meshing._march(keys, upper, support, samples, R, VS)
     cases = twin_cases(patchy)
-    place = {edge: reference.place_vertices(whole, edge, R, np.array([-1, 5, 0]), VS) for edge in reference.crossed_edges(cases)}
+    first = np.array([-1, 5, 0])
+    place = {edge: reference.place_vertices(whole, edge, R, first, VS) for edge in reference.crossed_edges(cases)}
     found = sorted(map(tuple, vertices.astype(float).tolist()))
     np.testing.assert_allclose(found, sorted(map(tuple, np.array(list(place.values())).tolist())), atol=ROUNDING)
     edge_table, wanted = meshing.marching_cubes_tables()[3], []
     for cell in np.argwhere(cases):
         for triangle in triangles_of(cases[tuple(cell)]):
-            wanted.append(np.concatenate([place[(*(cell + edge_table[e, :3]).tolist(), int(edge_table[e, 3]))] for e in triangle]))
+            wanted.append(np.concatenate([place[(*(cell + edge_table[e, :3]).tolist(), int(edge_table[e, 3]))]
+                                          for e in triangle]))
     wanted, emitted = np.array(wanted), vertices[faces].reshape(-1, 9)
     assert wanted.shape == emitted.shape
     nearest = np.abs(wanted[:, None] - emitted[None]).max(axis=2).argmin(axis=1)
@@ -220,8 +223,8 @@ def test_upper_cubes_are_found_by_key():
     keys = meshing.unique_rows(np.random.default_rng(0).integers(-3, 3, (60, 3)) + (8000, -8000, 0))
     rows = {key: n for n, key in enumerate(map(tuple, keys.tolist()))}
     assert sorted(rows) == list(rows)
-    np.testing.assert_array_equal(meshing._upper_cubes(keys), [[rows.get(tuple((key + step).tolist()), -1) for step in meshing.STEPS]
-                                                               for key in keys])
+    wanted = [[rows.get(tuple((key + step).tolist()), -1) for step in meshing.STEPS] for key in keys]
+    np.testing.assert_array_equal(meshing._upper_cubes(keys), wanted)
 
 
 def test_an_empty_map_has_an_empty_mesh():

@@ -46,9 +46,10 @@ def fill(grid: VoxelGrid, seed: int) -> dict[tuple, reference.Voxel]:
 
 
 def points_about_the_voxels() -> np.ndarray:
-    """Random points [m] in and around the voxels of `fill`, so that some are valid from one neighbour only and some not at all."""
+    """Random points [m] in and around the voxels of `fill`: some valid from one neighbour only, some not at all."""
     rng = np.random.default_rng(9)
-    return (np.vstack([rng.uniform(-4.5, 4.5, (400, 3)), [8.5, -7.5, 8.5] + rng.uniform(-4, 4, (100, 3))]) * 0.05).astype(np.float32)
+    lone = [8.5, -7.5, 8.5] + rng.uniform(-4, 4, (100, 3))
+    return (np.vstack([rng.uniform(-4.5, 4.5, (400, 3)), lone]) * 0.05).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -61,12 +62,14 @@ def in_voxels(points) -> np.ndarray:
     return (points * np.float32(1 / 0.05)).astype(float)
 
 
-@pytest.mark.parametrize(("channels", "prior", "blend"), [(1, "zero", True), (3, "mean", True), (3, "mean", False), (5, "zero", False)])
+@pytest.mark.parametrize(("channels", "prior", "blend"), [(1, "zero", True), (3, "mean", True), (3, "mean", False),
+                                                           (5, "zero", False)])
 def test_query_points_equals_its_twin(channels, prior, blend):
     target = PropertyMap("x", channels, prior=prior, blend=blend, **SETTINGS)
     voxels, points = fill(target._grid, channels), points_about_the_voxels()
     values, valid = target.query(points, return_valid=True)
-    twin, known = reference.query_points(ENCODER, voxels, in_voxels(points), blend=blend, centered=prior == "mean", reach=NEAREST_REACH)
+    twin, known = reference.query_points(ENCODER, voxels, in_voxels(points), blend=blend, centered=prior == "mean",
+                                          reach=NEAREST_REACH)
     np.testing.assert_array_equal(valid, known)
     assert 0.02 < valid.mean() < 0.95
     inside = (np.abs(in_voxels(points) % 1 - 0.5) > 1e-3).all(axis=1)  # there all tents are far above TINY_TENT
@@ -90,12 +93,14 @@ def test_blending_is_continuous_across_voxels():
     target = PropertyMap("x", 1, prior="zero", **SETTINGS)
     fill(target._grid, 5)
     steps = np.linspace(-0.14, 0.14, 20_001)
-    values, valid = target.query(np.column_stack([steps, 0.6 * steps, np.full_like(steps, 0.012)]).astype(np.float32), return_valid=True)
+    line = np.column_stack([steps, 0.6 * steps, np.full_like(steps, 0.012)])
+    values, valid = target.query(line, return_valid=True)
     jumps = np.abs(np.diff(values[:, 0]))[valid[1:] & valid[:-1]]
     assert np.median(jumps) > 0 and (jumps > 0.05).mean() < 1e-3  # jumps only where the set of known voxels changes
 
 
-@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((4, 3)), np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e9, 0, 0]])])
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((4, 3)),
+                                    np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e9, 0, 0]])])
 def test_any_points_can_be_asked_for(surface, points):
     target, _ = surface
     values, valid = target.sdf(points)

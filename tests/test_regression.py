@@ -41,15 +41,16 @@ def surface_twin(settings, *clouds) -> dict:
 
 
 def property_twin(target: PropertyMap, *clouds) -> dict:
-    return reference.fuse(reference.property_frame(encoder_of(target.settings), in_voxels(cloud, target.settings),
-                                                   cloud.attributes[target.name].astype(float), target.settings) for cloud in clouds)
+    settings = target.settings
+    return reference.fuse(reference.property_frame(encoder_of(settings), in_voxels(cloud, settings),
+                                                   cloud.attributes[target.name].astype(float), settings) for cloud in clouds)
 
 
 @pytest.mark.parametrize(("sampling", "gpis", "margin"), [
     ("cells", "samples", 1), ("cells", "samples", 2), ("cells", "derivatives", 1), ("points", "samples", 1),
     ("points", "derivatives", 1)])
 def test_surface_regression_equals_the_oracle(sampling, gpis, margin):
-    """Two frames through encode_cells or encode_points, claim_slots and fuse; more samples a voxel than a tile holds at once."""
+    """Two frames through encode_cells or encode_points, claim_slots and fuse; more samples a voxel than a tile holds."""
     target = SurfaceMap(sampling=sampling, gpis=gpis, margin=margin, min_points=5, sample_distance=0.2, **SIX_RANKS)
     clouds = rough(0), rough(1, 900)
     for cloud in clouds:
@@ -61,7 +62,8 @@ def test_surface_regression_equals_the_oracle(sampling, gpis, margin):
 
 
 @pytest.mark.parametrize(("name", "channels", "prior", "sampling", "margin"), [
-    ("one", 1, "zero", "cells", 1), ("rgb", 3, "mean", "cells", 1), ("five", 5, "mean", "cells", 2), ("rgb", 3, "mean", "points", 1)])
+    ("one", 1, "zero", "cells", 1), ("rgb", 3, "mean", "cells", 1), ("five", 5, "mean", "cells", 2),
+    ("rgb", 3, "mean", "points", 1)])
 def test_property_regression_equals_the_oracle(name, channels, prior, sampling, margin):
     target = PropertyMap(name, channels, prior=prior, sampling=sampling, margin=margin, min_points=3, **SIX_RANKS)
     clouds = rough(2), rough(3, 900)
@@ -84,7 +86,8 @@ def test_fuse_equals_its_twin():
     kernels.fuse(rows, channels, 40, slots, latents, weights, masks, fused, fused_weights, fused_masks)
 
     def voxels(F, w, m, keys):
-        return {int(k): reference.Voxel(F[n].astype(float), float(w[n]), m[n]) for n, k in enumerate(keys) if k >= 0 and w[n] > 0}
+        return {int(k): reference.Voxel(F[n].astype(float), float(w[n]), m[n])
+                for n, k in enumerate(keys) if k >= 0 and w[n] > 0}
 
     twin = reference.fuse([voxels(old, old_weights, old_masks, range(60)), voxels(latents, weights, masks, slots)])
     for slot in range(60):

@@ -126,7 +126,8 @@ def test_every_resolution_gives_the_same_closed_surface(scene, resolution):
     assert distance.max() < (ON_SPHERE if resolution >= 3 else 0.011), distance.max()
 
 
-@pytest.mark.parametrize("settings", [dict(gpis="derivatives"), dict(sampling="points"), dict(sampling="points", gpis="derivatives"),
+@pytest.mark.parametrize("settings", [dict(gpis="derivatives"), dict(sampling="points"),
+                                      dict(sampling="points", gpis="derivatives"),
                                       dict(margin=2), dict(noise=0.1, margin=2)],
                          ids=lambda settings: "-".join(f"{v}" for v in settings.values()))
 def test_N4_a_sphere_in_every_mode(settings):
@@ -166,8 +167,9 @@ def test_a_cloud_without_normals_is_refused(scene):
         scene.integrate(PointCloud(np.zeros((3, 3), np.float32)))
 
 
-@pytest.mark.parametrize("wrong", [dict(voxel_size=0.0), dict(noise=0.0), dict(min_points=0), dict(margin=3), dict(sampling="cell"),
-                                   dict(gpis="sample"), dict(sample_distance=0.0), dict(sample_distance=1.1), dict(support_points=-1)])
+@pytest.mark.parametrize("wrong", [dict(voxel_size=0.0), dict(noise=0.0), dict(min_points=0), dict(margin=3),
+                                   dict(sampling="cell"), dict(gpis="sample"), dict(sample_distance=0.0),
+                                   dict(sample_distance=1.1), dict(support_points=-1)])
 def test_settings_that_make_no_map_are_refused_by_name(wrong):
     with pytest.raises(InputError, match=f"^{next(iter(wrong))}: "):
         SurfaceMap(**wrong)

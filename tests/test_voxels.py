@@ -47,8 +47,10 @@ def keys_of(blocks: FrameBlocks) -> list[tuple]:
 def by_cell(blocks: FrameBlocks, keys: list[tuple]) -> dict:
     """Lattice cell -> (count, mean sums)."""
     counts, sums = blocks.counts.to_numpy(), blocks.sums.to_numpy() / kernels.FIXED
-    return {tuple((4 * np.array(keys[b]) + np.unravel_index(cell, (4, 4, 4))).tolist()): (counts[b, cell], sums[b, cell] / counts[b, cell])
-            for b, cell in np.argwhere(counts[:len(keys)])}
+    occupied = np.argwhere(counts[:len(keys)])
+    lattice = 4 * np.array(keys)[occupied[:, 0]] + np.stack(np.unravel_index(occupied[:, 1], (4, 4, 4)), axis=1)
+    return {tuple(at): (counts[b, cell], sums[b, cell] / counts[b, cell])
+            for at, (b, cell) in zip(lattice.tolist(), occupied, strict=True)}
 
 
 def test_touch_points_equals_its_twin(grid, cloud):
