@@ -25,9 +25,9 @@ STEPS = np.array(list(product((0, 1), repeat=3)))  # (8, 3) corners of a cube, x
 NORMAL_UNIT = float(1 << 18)                       # fixed-point one of summed normals, in squared grid spacings
 
 
-def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float, resolution: int, support_reach: int) -> Mesh:
-    """Zero level of the blended field on `resolution`^3 cells a voxel, only within `support_reach` cells of supported ones."""
-    keys, support = _cubes(grid, support_reach)
+def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float, resolution: int, support_closing: int) -> Mesh:
+    """Zero level of the blended field on `resolution`^3 cells a voxel, only in supported cells and those with `support_closing` supported neighbours."""
+    keys, support = _cubes(grid, support_closing)
     if not len(keys):
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
     upper = _upper_cubes(keys)
@@ -59,18 +59,18 @@ def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
                 {name: values[kept] for name, values in mesh.attributes.items()})
 
 
-def _cubes(grid: VoxelGrid, support_reach: int) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
+def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
     """Sorted keys (Q, 3) of the cubes that hold surface or close one that does, and their support masks (Q, 2)."""
     data = grid.export()
     keys = unique_rows((data.keys[:, None] + STEPS).reshape(-1, 3))
     support = np.empty((len(keys), 2), np.uint32)
     if len(keys):
-        query.corner_support(keys, grid.slot, grid.masks, support_reach, support)
+        query.corner_support(keys, grid.slot, grid.masks, support_closing, support)
         keys = keys[support.any(axis=1)]
         keys = unique_rows((keys[:, None] + STEPS).reshape(-1, 3))  # the last cells of a cube need the samples above
         support = np.empty((len(keys), 2), np.uint32)
         if len(keys):
-            query.corner_support(keys, grid.slot, grid.masks, support_reach, support)
+            query.corner_support(keys, grid.slot, grid.masks, support_closing, support)
     return keys, support
 
 

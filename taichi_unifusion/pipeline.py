@@ -93,7 +93,7 @@ class Pipeline:
         return extract_mesh(self.surface, self.properties, mesh.resolution if resolution is None else resolution, mesh.min_area)
 
 
-def extract_mesh(surface: SurfaceMap, properties: Mapping[str, PropertyMap], resolution: int, min_area: float) -> Mesh:
+def extract_mesh(surface: SurfaceMap, properties: Mapping[str, PropertyMap], resolution: int, min_area: float = 0.0) -> Mesh:
     """The surface as a mesh that carries every property that has data."""
     mesh = surface.extract_mesh(resolution, min_area)
     for name, source in properties.items():

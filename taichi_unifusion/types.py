@@ -131,6 +131,10 @@ class PointCloud:
                 raise InputError(f"point cloud: {name} must be (N, {columns or 'c'}) float32, got {array.shape} {array.dtype}")
             if len(array) != len(self.points):
                 raise InputError(f"point cloud: {len(self.points)} points but {len(array)} rows of {name}")
+        object.__setattr__(self, "points", np.ascontiguousarray(self.points))  # as kernels take them
+        object.__setattr__(self, "attributes", {name: np.ascontiguousarray(v) for name, v in self.attributes.items()})
+        if self.normals is not None:
+            object.__setattr__(self, "normals", np.ascontiguousarray(self.normals))
 
     def __len__(self) -> int:
         return len(self.points)

@@ -318,13 +318,14 @@ def tent_sum(voxels, corner, resolution):
     return sum(np.prod(1 - np.abs(u - step), axis=1) for step in CORNERS if tuple((corner - 1 + step).tolist()) in voxels)
 
 
-def corner_support(voxels, corner, reach):
-    """(4, 4, 4) cells of that cube within `reach` cells of a supported one."""
+def corner_support(voxels, corner, closing):
+    """(4, 4, 4) cells of that cube that are supported or have `closing` supported ones among their 26 neighbours."""
     supported = {tuple((CELLS * np.array(key) + np.unravel_index(n, [CELLS] * 3)).tolist())
                  for key, voxel in voxels.items() for n in np.flatnonzero(voxel.mask)}
     first = CELLS * np.array(corner) - CELLS // 2
-    near = list(product(range(-reach, reach + 1), repeat=3))
-    return np.array([any(tuple((first + at + step).tolist()) in supported for step in near)
+    near = [step for step in product((-1, 0, 1), repeat=3) if any(step)]
+    return np.array([tuple((first + at).tolist()) in supported
+                     or sum(tuple((first + at + step).tolist()) in supported for step in near) >= closing
                      for at in product(range(CELLS), repeat=3)]).reshape([CELLS] * 3)
 
 
@@ -415,12 +416,12 @@ def estimate_normals(inverse, fx, fy, cx, cy, radius, jump, cos_max_angle):
     height, width = inverse.shape
     normals = np.zeros((height, width, 3))
     for top, left in product(range(0, height, 2), range(0, width, 2)):
-        fitted_at = None
+        fitted_at, found = 0, 0
         for v, u in product(range(top, min(top + 2, height)), range(left, min(left + 2, width))):
             q = inverse[v, u]
             if q == 0:
                 continue
-            if fitted_at is None or abs(q - fitted_at) > 0.5 * jump * q:
+            if found == 0 or abs(q - fitted_at) > 0.5 * jump * q:
                 slope_u, slope_v, found = inverse_depth_slope(inverse, v, u, radius, jump)
                 fitted_at = q
             if found >= 2 * radius**2:

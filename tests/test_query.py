@@ -128,10 +128,10 @@ def test_a_constant_is_decoded_at_voxel_centres_of_neighbours_too():
 def test_corner_support_equals_its_twin(surface):
     target, voxels = surface
     corners = np.unique((np.array(list(voxels))[:, None] + STEPS).reshape(-1, 3), axis=0).astype(np.int32)
-    for reach in (0, 1):
+    for closing in (1, 9, 27):
         support = np.empty((len(corners), 2), np.uint32)
-        kernels.corner_support(corners, target._grid.slot, target._grid.masks, reach, support)
-        twin = [reference.corner_support(voxels, corner, reach).reshape(-1) for corner in corners]
+        kernels.corner_support(corners, target._grid.slot, target._grid.masks, closing, support)
+        twin = [reference.corner_support(voxels, corner, closing).reshape(-1) for corner in corners]
         np.testing.assert_array_equal(reference.unpack_masks(support), twin)
         assert 0.02 < np.mean(twin) < 0.9
 

@@ -17,7 +17,7 @@ SPHERE, BOX, PLANE = (0.013, 0.02, -0.03), (2.0, 0.01, 0.02), (-2.0, 0.0, 0.1)
 TILTED_U, TILTED_V = np.array([0.4, 0.0, 0.15]), np.array([-0.05, 0.35, 0.1])
 NORMAL = np.cross(TILTED_U, TILTED_V) / np.linalg.norm(np.cross(TILTED_U, TILTED_V))
 
-# Bounds in metres at 5 cm voxels and d = 1, about 1.5 times what was measured.
+# Bounds in metres at 5 cm voxels and d = 1, with a margin over what was measured.
 ON_SPHERE, ON_SPHERE_MEAN = 0.0025, 0.0008  # vertices; regularisation rounds the curvature off
 ON_PLANE = 0.0010                           # vertices on a tilted plane
 ON_BOX_FACE, ON_BOX_EDGE = 0.0030, 0.012    # a voxel's smooth latent rounds edges off
@@ -29,9 +29,9 @@ NORMAL_ANGLE = 8.0                          # degrees, of mesh normals on the sp
 def scene() -> SurfaceMap:
     """Sphere, box and tilted plane, far enough apart, in one map.
 
-    With no reach beyond seen cells, those that the surface only cuts at a corner stay open: closed surfaces need one cell.
+    With the default closing, some cells that the surface only cuts at a corner stay open: closed surfaces need 1.
     """
-    target = SurfaceMap(support_reach=1)
+    target = SurfaceMap(support_closing=1)
     target.integrate(joined(sphere(RADIUS, 0.006, SPHERE), box(HALF, 0.006, BOX), rectangle(PLANE, TILTED_U, TILTED_V, 0.006)))
     return target
 
@@ -131,7 +131,7 @@ def test_every_resolution_gives_the_same_closed_surface(scene, resolution):
                                       dict(margin=2), dict(noise=0.1, margin=2)],
                          ids=lambda settings: "-".join(f"{v}" for v in settings.values()))
 def test_N4_a_sphere_in_every_mode(settings):
-    target = SurfaceMap(support_reach=1, **settings)
+    target = SurfaceMap(support_closing=1, **settings)
     target.integrate(sphere(RADIUS, 0.006, SPHERE))
     mesh = target.extract_mesh(4)
     assert_closed(mesh.vertices, mesh.faces)

@@ -11,6 +11,7 @@ from scenes import moved, rough, taken
 
 from taichi_unifusion import runtime
 from taichi_unifusion.errors import CapacityError, OutOfRange, RuntimeStateError
+from taichi_unifusion.kernels import cells as cell_kernels
 from taichi_unifusion.kernels import voxels as kernels
 from taichi_unifusion.kernels.regression import find_neighbors
 from taichi_unifusion.maps import voxel_grid
@@ -46,7 +47,7 @@ def keys_of(blocks: FrameBlocks) -> list[tuple]:
 
 def by_cell(blocks: FrameBlocks, keys: list[tuple]) -> dict:
     """Lattice cell -> (count, mean sums)."""
-    counts, sums = blocks.counts.to_numpy(), blocks.sums.to_numpy() / kernels.FIXED
+    counts, sums = blocks.counts.to_numpy(), blocks.sums.to_numpy() / cell_kernels.FIXED
     occupied = np.argwhere(counts[:len(keys)])
     lattice = 4 * np.array(keys)[occupied[:, 0]] + np.stack(np.unravel_index(occupied[:, 1], (4, 4, 4)), axis=1)
     return {tuple(at): (counts[b, cell], sums[b, cell] / counts[b, cell])
@@ -140,7 +141,7 @@ def test_mark_and_compact_cells_equal_their_twins(grid, cloud):
     blocks.touch(cloud.points, VS)
     blocks.bin(cloud.points, cloud.normals, VS)
     keys, counts = keys_of(blocks), blocks.counts.to_numpy()[:blocks.count]
-    rows = reference.compact_cells(counts, blocks.sums.to_numpy()[:blocks.count] / kernels.FIXED)
+    rows = reference.compact_cells(counts, blocks.sums.to_numpy()[:blocks.count] / cell_kernels.FIXED)
     lattice = {cell: value[0] for cell, value in by_cell(blocks, keys).items()}
     blocks.compact(3)
     for minimum, masks in ((1, blocks.masks), (3, blocks.support)):

@@ -88,7 +88,7 @@ def estimate_normals(
                 q = inverse[v, u]
                 n = ti.Vector([0.0, 0.0, 0.0])
                 if q > 0:
-                    if of == 0.0 or ti.abs(q - of) > 0.5 * jump * q:
+                    if found == 0.0 or ti.abs(q - of) > 0.5 * jump * q:
                         slope_u, slope_v, found = inverse_depth_slope(inverse, v, u, radius, jump)
                         of = q
                     if found >= 2 * radius * radius:

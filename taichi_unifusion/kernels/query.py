@@ -2,8 +2,9 @@
 
 import taichi as ti
 
+from .cells import cell_index
 from .encoding import position_features
-from .voxels import CELLS, INDEX_HALF, Floats1, Floats2, Floats3, Ints2, Masks2, all_within, row3, voxel_of
+from .voxels import BLOCK_CELLS, CELLS, INDEX_HALF, Floats1, Floats2, Floats3, Ints2, Masks2, all_within, row3, voxel_of
 
 UNKNOWN = 1e9  # signed distance where no voxel reaches
 
@@ -31,7 +32,7 @@ def nearest_voxel(x: ti.template(), reach: ti.i32, slot: ti.template()):
     found, at, nearest = -1, home, 1e9
     for o in range((2 * reach + 1) ** 3):
         edge = 2 * reach + 1
-        ijk = home + ti.Vector([o // (edge * edge), o // edge % edge, o % edge]) - reach
+        ijk = ti.math.clamp(home + ti.Vector([o // (edge * edge), o // edge % edge, o % edge]) - reach, -INDEX_HALF, INDEX_HALF - 1)
         s = slot[ijk + INDEX_HALF] - 1
         distance = (x - ijk - 0.5).norm_sqr()
         if s >= 0 and distance < nearest:
@@ -58,7 +59,7 @@ def query_points(
         x = row3(points, n) * per_meter
         total = ti.Vector([0.0] * channels)
         weight = 0.0
-        if all_within(x, INDEX_HALF - 8.0):
+        if all_within(x, INDEX_HALF - 1.0):
             corner = voxel_of(x - 0.5) if ti.static(blend) else voxel_of(x)
             for o in range(8 if ti.static(blend) else 1):
                 ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
@@ -68,7 +69,8 @@ def query_points(
                     tent = 1.0
                     if ti.static(blend):
                         for d in ti.static(range(3)):
-                            tent *= ti.max(1.0 - 2.0 * ti.abs(t[d]), 1e-6)
+                            tent *= ti.max(1.0 - 2.0 * ti.abs(t[d]), 0.0)
+                        tent = ti.max(tent, 1e-6)  # on the border of the only voxel there is, its value still counts
                     total += tent * decode(rank, channels, centered, s, t, latents, anchors, projection, scale)
                     weight += tent
             valid[n] = ti.cast(weight > 0, ti.u8)
@@ -95,12 +97,12 @@ def corner_support(
     keys: Ints2,           # (Q, 3) lattice corners; the cube of corner q spans the centres of its eight voxels
     slot: ti.template(),
     map_masks: Masks2,     # (S, 2) support of each voxel's cells
-    reach: ti.i32,         # cells, 0..2
+    closing: ti.i32,       # a cell with at least so many of its 26 neighbours supported is taken in: pinholes close, rims stay
     # out:
-    support: Masks2,       # (Q, 2) cells of the cube within reach of a supported one, as `occupancy` numbers them
+    support: Masks2,       # (Q, 2) supported cells of the cube, as `mark_cells` numbers them
 ):
     for q in range(keys.shape[0]):
-        reached = ti.Vector([ti.u32(0), ti.u32(0)])
+        around = ti.Vector([0] * BLOCK_CELLS)
         for o in range(8):
             s = corner_slot(keys, q, o, slot)
             if s >= 0:
@@ -111,15 +113,18 @@ def corner_support(
                     while mask != 0:
                         k = ti.math.clz(ti.cast(mask, ti.i32))
                         mask ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
-                        cell = half * 32 + k
-                        at = base + ti.Vector([cell // (CELLS * CELLS), cell // CELLS % CELLS, cell % CELLS])
-                        for i in range(ti.max(at[0] - reach, 0), ti.min(at[0] + reach + 1, CELLS)):
-                            for j in range(ti.max(at[1] - reach, 0), ti.min(at[1] + reach + 1, CELLS)):
-                                for l in range(ti.max(at[2] - reach, 0), ti.min(at[2] + reach + 1, CELLS)):
-                                    bit = (i * CELLS + j) * CELLS + l
-                                    reached[bit // 32] |= ti.u32(1) << ti.cast(31 - bit % 32, ti.u32)
-        for half in ti.static(range(2)):
-            support[q, half] = reached[half]
+                        at = base + cell_index(half * 32 + k)
+                        for i in range(ti.max(at[0] - 1, 0), ti.min(at[0] + 2, CELLS)):
+                            for j in range(ti.max(at[1] - 1, 0), ti.min(at[1] + 2, CELLS)):
+                                for l in range(ti.max(at[2] - 1, 0), ti.min(at[2] + 2, CELLS)):
+                                    itself = i == at[0] and j == at[1] and l == at[2]
+                                    around[(i * CELLS + j) * CELLS + l] += 27 if itself else 1
+        for half in range(2):
+            reached = ti.u32(0)
+            for k in range(32):
+                if around[half * 32 + k] >= ti.min(closing, 27):
+                    reached |= ti.u32(1) << ti.cast(31 - k, ti.u32)
+            support[q, half] = reached
 
 
 @ti.kernel

@@ -65,11 +65,11 @@ class BaseMap(ABC):
     def integrate(self, cloud: PointCloud) -> Integration:
         """Fuse a cloud in world coordinates into the map.
 
-        A cloud without points changes nothing. Raises InputError where the cloud lacks what the map needs, OutOfRange for
+        A cloud without points changes nothing; points whose normal or value is not finite are left out. Raises InputError where the cloud lacks what the map needs, OutOfRange for
         points beyond the index range, CapacityError where the map would grow beyond safe memory; the map is then unchanged.
         """
         runtime.check_alive(self._grid.runtime)
-        self._check(cloud)
+        cloud = _finite_rows(cloud, self._observed(cloud))
         if len(cloud) == 0:
             return Integration(0, 0, len(self))
         encode = self._encode_cells if self.settings.sampling == "cells" else self._encode_points
@@ -78,8 +78,8 @@ class BaseMap(ABC):
         return Integration(len(cloud), encoded, len(self))
 
     @abstractmethod
-    def _check(self, cloud: PointCloud) -> None:
-        """Raise InputError unless the cloud has what this map needs."""
+    def _observed(self, cloud: PointCloud) -> NDArray[np.float32]:
+        """What this map takes from the cloud beside its points, (N, c); raises InputError where that is missing."""
 
     @abstractmethod
     def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
@@ -153,6 +153,17 @@ class BaseMap(ABC):
             if array is None or array.shape != shape or array.dtype != dtype:
                 found = "nothing" if array is None else f"{array.shape} {array.dtype}"
                 raise MapCorrupt(f"{path}: tensor '{name}' should be {shape} {np.dtype(dtype)}, found {found}; write the map again")
-        if n and not (np.abs(data.keys.astype(np.int64)).max() < voxels.INDEX_HALF and np.isfinite(data.weights).all()
+        if n and not (data.keys.min() >= -voxels.INDEX_HALF and data.keys.max() < voxels.INDEX_HALF and np.isfinite(data.weights).all()
                       and (data.weights > 0).all() and np.isfinite(data.latents).all()):
             raise MapCorrupt(f"{path}: holds voxels out of range or numbers that are not finite; write the map again")
+        if len(np.unique(data.keys, axis=0)) != max(n, 0):
+            raise MapCorrupt(f"{path}: holds a voxel twice; write the map again")
+
+
+def _finite_rows(cloud: PointCloud, observed: NDArray[np.float32]) -> PointCloud:
+    """The cloud without the points at which something observed is NaN or infinite."""
+    if np.isfinite(observed.sum()):  # one pass; a sum is finite only if all its terms are
+        return cloud
+    rows = np.isfinite(observed).all(axis=1)
+    return PointCloud(cloud.points[rows], None if cloud.normals is None else cloud.normals[rows],
+                      {name: values[rows] for name, values in cloud.attributes.items()})

@@ -7,7 +7,8 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from ..errors import OutOfRange
-from ..kernels import voxels as kernels
+from ..kernels import cells as kernels
+from ..kernels.voxels import BLOCK_CELLS, INDEX_HALF, touch_points
 from .voxel_grid import VoxelGrid
 
 CPU_CHUNK = 64  # consecutive points a thread takes: long enough for runs in one cell, short enough to balance
@@ -28,8 +29,8 @@ class FrameBlocks:
 
     def _allocate(self, capacity: int) -> None:
         self.keys = ti.ndarray(ti.i32, (capacity, 3))
-        self.counts = ti.ndarray(ti.i32, (capacity, kernels.BLOCK_CELLS))
-        self.sums = ti.ndarray(ti.i64, (capacity, kernels.BLOCK_CELLS, self.channels + 3 * self.with_positions))
+        self.counts = ti.ndarray(ti.i32, (capacity, BLOCK_CELLS))
+        self.sums = ti.ndarray(ti.i64, (capacity, BLOCK_CELLS, self.channels + 3 * self.with_positions))
         self.masks, self.support = ti.ndarray(ti.u32, (capacity, 2)), ti.ndarray(ti.u32, (capacity, 2))
         self.totals = ti.ndarray(ti.i32, (capacity,))
 
@@ -45,12 +46,12 @@ class FrameBlocks:
         while True:
             self.frame = self.grid.next_frame()
             counters = np.zeros(2, np.int32)
-            kernels.touch_points(points, 1.0 / voxel_size, self.frame, self.chunk, spread, self.grid.stamp,
-                                 self.grid.block, self.keys, counters)
+            touch_points(points, 1.0 / voxel_size, self.frame, self.chunk, spread, self.grid.stamp, self.grid.block, self.keys,
+                         counters)
             ti.sync()
             self.count, outside = int(counters[0]), int(counters[1])
             if outside:
-                reach = kernels.INDEX_HALF * voxel_size
+                reach = INDEX_HALF * voxel_size
                 raise OutOfRange(f"{outside} of {len(points)} points lie more than {reach:.0f} m from the origin or are not finite: "
                                  "move the origin nearer to the scene, or use larger voxels")
             if self.count <= self.capacity:

@@ -42,13 +42,14 @@ class PropertyMap(BaseMap):
     def _restore(cls, name: str, channels: int, settings: PropertySettings) -> PropertyMap:
         return cls(name, channels, settings)
 
-    def _check(self, cloud: PointCloud) -> None:
+    def _observed(self, cloud: PointCloud) -> NDArray[np.float32]:
         values = cloud.attributes.get(self.name)
         if values is None:
             raise InputError(f"property map '{self.name}': the cloud has no attribute '{self.name}', only "
                              f"{', '.join(sorted(cloud.attributes)) or 'none'}")
         if values.shape[1] != self.channels:
             raise InputError(f"property map '{self.name}': expected {self.channels} channels, the cloud has {values.shape[1]}")
+        return values
 
     def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
         self._cells.touch(cloud.points, self.voxel_size)

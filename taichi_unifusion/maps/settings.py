@@ -50,8 +50,8 @@ class SurfaceSettings(MapSettings):
     """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one frame (fewer where a whole voxel has
     few); 0: everywhere in voxels that held any."""
 
-    support_reach: int = 0
-    """How many cells beyond seen cells surface may be extracted."""
+    support_closing: int = 14
+    """Cells with at least this many of their 26 neighbours seen count as seen too, which closes pinholes; 27: none, 1: a rim all around."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,6 +59,8 @@ class SurfaceSettings(MapSettings):
             raise InputError(f"sample_distance: must lie in (0, 1] voxels, got {self.sample_distance}")
         if self.support_points < 0:
             raise InputError(f"support_points: must not be negative, got {self.support_points}")
+        if not 1 <= self.support_closing <= 27:
+            raise InputError(f"support_closing: must lie in 1..27 neighbours, got {self.support_closing}")
         _check_choice("gpis", self.gpis, ("samples", "derivatives"))
 
 

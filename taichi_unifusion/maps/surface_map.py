@@ -42,9 +42,10 @@ class SurfaceMap(BaseMap):
     def _restore(cls, name: str, channels: int, settings: SurfaceSettings) -> SurfaceMap:
         return cls(settings)
 
-    def _check(self, cloud: PointCloud) -> None:
+    def _observed(self, cloud: PointCloud) -> NDArray[np.float32]:
         if cloud.normals is None:
             raise InputError("surface map: the cloud has no normals; `preprocess` computes them, or give your own")
+        return cloud.normals
 
     def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
         """Average points and normals in cells; each average is a surfel that gives samples at the cells along its normal.
@@ -88,5 +89,5 @@ class SurfaceMap(BaseMap):
         runtime.check_alive(self._grid.runtime)
         if not 1 <= resolution <= 32:
             raise InputError(f"extract_mesh: resolution must lie in 1..32 cells a voxel, got {resolution}")
-        mesh = extract_mesh(self._grid, self._regressor.encoding, self.voxel_size, resolution, self.settings.support_reach)
+        mesh = extract_mesh(self._grid, self._regressor.encoding, self.voxel_size, resolution, self.settings.support_closing)
         return drop_small_parts(mesh, min_area)

@@ -19,6 +19,7 @@ from ..kernels import voxels as kernels
 
 SPARSE_LIMIT = 1 << 30       # bytes of sparse nodes: Taichi's CPU pool fails silently somewhat above 1.6 GB
 BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16  # a 4^3 leaf with three i32 fields and its share of the nodes above it
+CHECK_EVERY = 2000           # touched voxels between two counts of the leaves, at least
 FIRST_CAPACITY = 4096
 
 
@@ -55,7 +56,7 @@ class VoxelGrid:
         self._tree = self._borrow_tree()
         self.slot, self.stamp, self.block, self.leaf_parent = self._tree
         self._allocate(FIRST_CAPACITY)
-        self._leaves, self._count_at_check = 0, 0
+        self._leaves, self._touched = 0, 0
 
     def _borrow_tree(self) -> tuple:
         """An empty index tree: one that a map no longer uses, else a new one. Taichi never frees the memory of a tree."""
@@ -82,13 +83,21 @@ class VoxelGrid:
         self.frame += 1
         return self.frame
 
-    def reserve(self, extra: int) -> None:
-        """Make room for `extra` more voxels; raises CapacityError before sparse memory becomes unsafe."""
-        if self.count > 1.2 * self._count_at_check + 1000:
-            self._leaves, self._count_at_check = int(kernels.count_leaves(self.leaf_parent)), self.count
+    def note_touched(self, voxels: int) -> None:
+        """Count the index's leaves now and then: touching a voxel takes sparse memory also if it is never encoded.
+
+        Raises CapacityError before that memory becomes unsafe.
+        """
+        self._touched += voxels
+        if self._touched > max(CHECK_EVERY, self._leaves):
+            self._leaves, self._touched = int(kernels.count_leaves(self.leaf_parent)), 0
         if self._leaves * BYTES_PER_LEAF > SPARSE_LIMIT:
             raise CapacityError(f"the map holds {self.count:,} voxels and its index would pass 1 GB, where Taichi is no longer "
                                 "safe: use larger voxels or save the map and start a new one")
+
+    def reserve(self, extra: int) -> None:
+        """Make room for `extra` more voxels; raises CapacityError before sparse memory becomes unsafe."""
+        self.note_touched(extra)
         if self.count + extra <= self.capacity:
             return
         old = self.keys, self.latents, self.weights, self.masks
