@@ -4,8 +4,9 @@
     python benchmarks/rendering.py replica PATH --depth-max 10
     python benchmarks/rendering.py 7scenes PATH --end 200 --every 10 --config configs/paper.yaml
 
-Depth by casting the pixels' rays at the mesh (Open3D), colour decoded from the colour map at the points they hit, as the paper does.
-L1 and PSNR are means over frames, taken where both the reading and the mesh exist; coverage is the share of readings with a hit.
+Depth by casting the pixels' rays at the mesh (Open3D), colour decoded from the colour map at the points they hit, as the paper
+does. L1 and PSNR are means over frames, taken where both the reading and the mesh exist; coverage is the share of readings with
+a hit.
 """
 
 from __future__ import annotations

@@ -3,9 +3,10 @@
     python benchmarks/speed.py 7scenes PATH --end 300 --every 3
     python benchmarks/speed.py synthetic --every 2
 
-Ours: preprocess + surface map at 5 cm + colour map at 2 cm, with the defaults. Peer: `VoxelBlockGrid` with colour at 1 cm in blocks
-of 8, on the CPU. They take turns, ten frames each, so that a busy machine slows both; medians and their ratio are printed. Frames are
-loaded before the clock starts, and between turns all threads come to rest (OpenMP's spin for a while when they have no work). `--growth` shows instead how the time a frame depends on the size of the map.
+Ours: preprocess + surface map at 5 cm + colour map at 2 cm, with the defaults. Peer: `VoxelBlockGrid` with colour at 1 cm in
+blocks of 8, on the CPU. They take turns, ten frames each, so that a busy machine slows both; medians and their ratio are
+printed. Frames are loaded before the clock starts, and between turns all threads come to rest (OpenMP's spin for a while when
+they have no work). `--growth` shows instead how the time a frame depends on the size of the map.
 """
 
 from __future__ import annotations
@@ -139,8 +140,9 @@ def main() -> None:
     Console().print(table)
     total = clock.per_frame(*ours.stages)[2:]
     tsdf = np.array(clock.laps["open3d"])[2:]
-    print(f"ours {np.median(total):.1f} ms a frame, Open3D {np.median(tsdf):.1f} ms a frame, ratio {np.median(total) / np.median(tsdf):.2f}"
-          f" (fastest frames {total.min():.1f} and {tsdf.min():.1f}, ratio {total.min() / tsdf.min():.2f}); peak memory of both "
+    print(f"ours {np.median(total):.1f} ms a frame, Open3D {np.median(tsdf):.1f} ms a frame, "
+          f"ratio {np.median(total) / np.median(tsdf):.2f} (fastest frames {total.min():.1f} and {tsdf.min():.1f}, "
+          f"ratio {total.min() / tsdf.min():.2f}); peak memory of both "
           f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB")
 
 

@@ -63,8 +63,8 @@ class PositionEncoding:
         distance = np.linalg.norm(self.anchors[:, None] - self.anchors[None], axis=2)
         values, vectors = np.linalg.eigh(matern72(distance, self.settings.length_scale))
         values, vectors = values[::-1][:self.settings.rank], vectors[:, ::-1][:, :self.settings.rank]
-        vectors = vectors * np.sign(vectors[np.abs(vectors).argmax(axis=0), np.arange(self.settings.rank)])  # one sign on every machine
-        return vectors / np.sqrt(values)
+        largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(self.settings.rank)]
+        return vectors * np.sign(largest) / np.sqrt(values)  # eigenvectors of the same sign on every machine
 
     def __call__(self, t: NDArray) -> NDArray[np.float64]:
         """f_posi: (N, 3) encoder coordinates -> (N, l)."""

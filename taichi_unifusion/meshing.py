@@ -26,7 +26,10 @@ NORMAL_UNIT = float(1 << 18)                       # fixed-point one of summed n
 
 
 def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float, resolution: int, support_closing: int) -> Mesh:
-    """Zero level of the blended field on `resolution`^3 cells a voxel, only in supported cells and those with `support_closing` supported neighbours."""
+    """Zero level of the blended field on `resolution`^3 cells a voxel, only where cells are supported.
+
+    A cell with `support_closing` of its 26 neighbours supported counts as supported.
+    """
     keys, support = _cubes(grid, support_closing)
     if not len(keys):
         return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
@@ -49,7 +52,8 @@ def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
     if min_area <= 0 or not len(mesh.faces):
         return mesh
     a, b, c = mesh.faces.T
-    links = coo_array((np.ones(2 * len(a), np.int8), (np.concatenate([a, b]), np.concatenate([b, c]))), (len(mesh.vertices),) * 2)
+    links = np.concatenate([a, b]), np.concatenate([b, c])
+    links = coo_array((np.ones(len(links[0]), np.int8), links), (len(mesh.vertices),) * 2)
     part = connected_components(links, directed=False)[1]
     corners = mesh.vertices[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2

@@ -32,7 +32,8 @@ class PreprocessSettings:
         if not 0 < self.depth_min < self.depth_max:
             raise InputError(f"preprocess: need 0 < depth_min < depth_max, got {self.depth_min} and {self.depth_max}")
         if not 0 < self.edge_jump < 1 or not 0 <= self.edge_support <= 8:
-            raise InputError(f"preprocess: need 0 < edge_jump < 1 and edge_support in 0..8, got {self.edge_jump} and {self.edge_support}")
+            raise InputError(f"preprocess: need 0 < edge_jump < 1 and edge_support in 0..8, got {self.edge_jump} and "
+                             f"{self.edge_support}")
         if not 1 <= self.normal_radius <= 20 or not 0 < self.max_angle <= 90:
             raise InputError(f"preprocess: need normal_radius in 1..20 and max_angle in (0, 90], got {self.normal_radius} "
                              f"and {self.max_angle}")

@@ -11,12 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .datasets.checks import guess_depth_scale
+from .datasets.pose_convention import guess_pose_convention, has_moved
 from .errors import DatasetError, FrameError, OutOfRange, PoseError, SizeMismatch, UniFusionError
 from .loading import index_in_recording, recording_of
 from .maps import Integration
 from .types import Frame, Trajectory
 
 logger = logging.getLogger(__name__)
+
+POSE_PAIRS = 5  # frames that may overlap too little to tell how poses are meant
 
 
 class EmptyFrame(FrameError):
@@ -77,6 +80,8 @@ class RunLog:
         self.poses: list[tuple[float | None, np.ndarray]] = []  # time stamp, T_world_camera
         self.warnings: list[str] = []
         self.scale_checked = self.color_missing = False
+        self.reference: Frame | None = None  # with which poses are checked
+        self.pose_pairs = POSE_PAIRS         # left to check them with
         for sentence in getattr(sequence, "warnings", ()):
             self.warn(sentence)
 
@@ -93,12 +98,26 @@ class RunLog:
         if guess := guess_depth_scale(frame.depth, scale):
             self.warn(f"{name_of(frame)}: {guess}")
 
+    def check_poses(self, frame: Frame) -> None:
+        """Warn if an early pair of frames says that the poses are to be read in another way."""
+        if self.pose_pairs == 0:
+            return
+        if self.reference is None or not has_moved(self.reference, frame):
+            self.reference = self.reference or frame
+            return
+        decided, sentence = guess_pose_convention(self.reference, frame)
+        self.pose_pairs = 0 if decided else self.pose_pairs - 1
+        self.reference = frame if self.pose_pairs else None
+        if sentence:
+            self.warn(f"{name_of(frame)}: {sentence}")
+
     def add_step(self, frame: Frame, step: StepResult, waited: float) -> None:
         if frame.color is None and not self.color_missing:
             self.color_missing = True
             self.warn(f"{name_of(frame)}: there is no colour image; frames without one add to the surface only")
         self.steps.append(replace(step, milliseconds={"load": 1e3 * waited, **step.milliseconds}))
         self.poses.append((frame.timestamp, frame.T_world_camera))
+        self.check_poses(frame)
 
     def add_skipped(self, i: int, error: UniFusionError) -> None:
         reason = next(reason for kind, reason in SKIP_REASONS.items() if isinstance(error, kind))

@@ -35,8 +35,8 @@ class PinholeCamera:
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: image size must be positive, got {self.width}x{self.height}")
         if not (0 <= self.cx <= self.width and 0 <= self.cy <= self.height):
-            raise InputError(f"camera: principal point ({self.cx}, {self.cy}) lies outside the {self.width}x{self.height} image; "
-                             "are these the intrinsics of another resolution?")
+            raise InputError(f"camera: principal point ({self.cx}, {self.cy}) lies outside the "
+                             f"{self.width}x{self.height} image; are these the intrinsics of another resolution?")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -196,7 +196,8 @@ class Trajectory:
     def __post_init__(self) -> None:
         n = len(self.timestamps)
         if self.timestamps.shape != (n,) or self.T_world_camera.shape != (n, 4, 4):
-            raise InputError(f"trajectory: expected (N,) and (N, 4, 4), got {self.timestamps.shape} and {self.T_world_camera.shape}")
+            raise InputError(f"trajectory: expected (N,) and (N, 4, 4), got {self.timestamps.shape} and "
+                             f"{self.T_world_camera.shape}")
 
     def __len__(self) -> int:
         return len(self.timestamps)

@@ -147,7 +147,8 @@ def bin_surfel_samples(
                         ti.atomic_add(sample_sums[at, target, 0], ti.cast(ti.round(distance * FIXED), ti.i64) * count)
                         if ti.static(with_normals):
                             for d in ti.static(range(3)):
-                                ti.atomic_add(sample_sums[at, target, 1 + d], ti.cast(ti.round(normal[d] * FIXED), ti.i64) * count)
+                                along = ti.cast(ti.round(normal[d] * FIXED), ti.i64)
+                                ti.atomic_add(sample_sums[at, target, 1 + d], along * count)
                 counts[b, cell] = 0
                 for c in ti.static(range(6)):
                     sums[b, cell, c] = ti.i64(0)

@@ -32,7 +32,8 @@ def nearest_voxel(x: ti.template(), reach: ti.i32, slot: ti.template()):
     found, at, nearest = -1, home, 1e9
     for o in range((2 * reach + 1) ** 3):
         edge = 2 * reach + 1
-        ijk = ti.math.clamp(home + ti.Vector([o // (edge * edge), o // edge % edge, o % edge]) - reach, -INDEX_HALF, INDEX_HALF - 1)
+        step = ti.Vector([o // (edge * edge), o // edge % edge, o % edge]) - reach
+        ijk = ti.math.clamp(home + step, -INDEX_HALF, INDEX_HALF - 1)
         s = slot[ijk + INDEX_HALF] - 1
         distance = (x - ijk - 0.5).norm_sqr()
         if s >= 0 and distance < nearest:

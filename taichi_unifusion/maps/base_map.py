@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..encoding import EncoderSettings, position_encoding
+from ..encoding import EncoderSettings
 from ..errors import InputError, MapCorrupt
 from ..kernels import regression, voxels
 from ..map_files import read_map, write_map
@@ -45,8 +45,7 @@ class BaseMap(ABC):
         self.name, self.channels, self.settings = name, channels, settings
         self._centered = centered
         self._grid = VoxelGrid(settings.encoder.rank + centered, channels)
-        self._regressor = Regressor(position_encoding(settings.encoder), self._grid, voxel_size=settings.voxel_size,
-                                    channels=channels, centered=centered, derivatives=derivatives, margin=settings.margin, noise=settings.noise, min_points=settings.min_points)
+        self._regressor = Regressor(self._grid, settings, channels=channels, centered=centered, derivatives=derivatives)
 
     @property
     def voxel_size(self) -> float:
@@ -65,8 +64,9 @@ class BaseMap(ABC):
     def integrate(self, cloud: PointCloud) -> Integration:
         """Fuse a cloud in world coordinates into the map.
 
-        A cloud without points changes nothing; points whose normal or value is not finite are left out. Raises InputError where the cloud lacks what the map needs, OutOfRange for
-        points beyond the index range, CapacityError where the map would grow beyond safe memory; the map is then unchanged.
+        A cloud without points changes nothing; points whose normal or value is not finite are left out. Raises InputError where
+        the cloud lacks what the map needs, OutOfRange for points beyond the index range, CapacityError where the map would grow
+        beyond safe memory; the map is then unchanged.
         """
         runtime.check_alive(self._grid.runtime)
         cloud = _finite_rows(cloud, self._observed(cloud))
@@ -152,9 +152,10 @@ class BaseMap(ABC):
             array = getattr(data, name)
             if array is None or array.shape != shape or array.dtype != dtype:
                 found = "nothing" if array is None else f"{array.shape} {array.dtype}"
-                raise MapCorrupt(f"{path}: tensor '{name}' should be {shape} {np.dtype(dtype)}, found {found}; write the map again")
-        if n and not (data.keys.min() >= -voxels.INDEX_HALF and data.keys.max() < voxels.INDEX_HALF and np.isfinite(data.weights).all()
-                      and (data.weights > 0).all() and np.isfinite(data.latents).all()):
+                raise MapCorrupt(f"{path}: tensor '{name}' should be {shape} {np.dtype(dtype)}, found {found}; "
+                                 "write the map again")
+        if n and not (data.keys.min() >= -voxels.INDEX_HALF and data.keys.max() < voxels.INDEX_HALF
+                      and np.isfinite(data.weights).all() and (data.weights > 0).all() and np.isfinite(data.latents).all()):
             raise MapCorrupt(f"{path}: holds voxels out of range or numbers that are not finite; write the map again")
         if len(np.unique(data.keys, axis=0)) != max(n, 0):
             raise MapCorrupt(f"{path}: holds a voxel twice; write the map again")

@@ -52,8 +52,8 @@ class FrameBlocks:
             self.count, outside = int(counters[0]), int(counters[1])
             if outside:
                 reach = INDEX_HALF * voxel_size
-                raise OutOfRange(f"{outside} of {len(points)} points lie more than {reach:.0f} m from the origin or are not finite: "
-                                 "move the origin nearer to the scene, or use larger voxels")
+                raise OutOfRange(f"{outside} of {len(points)} points lie more than {reach:.0f} m from the origin or are not "
+                                 "finite: move the origin nearer to the scene, or use larger voxels")
             if self.count <= self.capacity:
                 return
             self._allocate(self.count * 5 // 4)
@@ -84,7 +84,7 @@ class FrameBlocks:
                                    surfels.counts, surfels.sums, self.counts, self.sums)
 
     def compact(self, support_points: int) -> None:
-        """Sums -> `starts` and `cells`, a row for every cell with points; support masks need `support_points`; sums become 0."""
+        """Sums -> `starts` and `cells`, a row for every cell with points, and support by `support_points`; sums become 0."""
         occupied = np.empty(self.count, np.int32)
         kernels.mark_cells(self.count, self.counts, support_points, self.masks, self.support, self.totals, occupied)
         ti.sync()

@@ -8,12 +8,13 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from ..encoding import PositionEncoding
+from ..encoding import position_encoding
 from ..errors import InputError
 from ..kernels import query
 from ..kernels import regression as kernels
 from ..kernels.voxels import CELLS
 from .frame_blocks import FrameBlocks
+from .settings import MapSettings
 from .voxel_grid import VoxelGrid
 
 CPU_WORKERS, CPU_STRIDE = 64, 512  # Taichi cuts a CPU loop into chunks of at least 512 iterations: a worker per chunk
@@ -23,12 +24,11 @@ GPU_WORKERS, GPU_STRIDE = 8192, 1
 class Regressor:
     """Encodes the blocks of a frame: F, w for every voxel with enough samples in it."""
 
-    def __init__(self, encoding: PositionEncoding, grid: VoxelGrid, *, voxel_size: float, channels: int, centered: bool, derivatives: bool,
-                 margin: int,
-                 noise: float, min_points: int) -> None:
-        self.encoding, self.grid = encoding, grid
+    def __init__(self, grid: VoxelGrid, settings: MapSettings, *, channels: int, centered: bool, derivatives: bool) -> None:
+        self.grid = grid
+        self.encoding = encoding = position_encoding(settings.encoder)
         self.channels, self.centered, self.derivatives = channels, centered, derivatives
-        self.voxel_size, self.noise, self.min_points = voxel_size, noise, min_points
+        self.voxel_size, self.noise, self.min_points = settings.voxel_size, settings.noise, settings.min_points
         self.rank = encoding.settings.rank
         self.size = _round_up(self.rank)
         self.rows = self.size + _round_up(channels + centered)
@@ -39,7 +39,7 @@ class Regressor:
         on_cpu = grid.runtime.device == "cpu"
         self.workers, self.stride = (CPU_WORKERS, CPU_STRIDE) if on_cpu else (GPU_WORKERS, GPU_STRIDE)
         self.window = ti.ndarray(ti.u32, (27, 2))
-        self.window.from_numpy(_window_masks(margin))
+        self.window.from_numpy(_window_masks(settings.margin))
         self.tiles = self._shared_tiles()
         self.neighbors = ti.ndarray(ti.i32, (1, 27))
         self.latents = ti.ndarray(ti.f32, (1, 1, 1))
@@ -77,8 +77,8 @@ class Regressor:
         """Encode from the blocks' compacted cells."""
         self._begin(blocks)
         kernels.encode_cells(self.rank, self.size, self.rows, self.channels, self.centered, self.derivatives,
-                             blocks.count, self.neighbors, blocks.masks, self.window, blocks.totals, blocks.starts, blocks.cells,
-                             self.cell_features, self.min_points, self.noise, self.workers, self.stride,
+                             blocks.count, self.neighbors, blocks.masks, self.window, blocks.totals, blocks.starts,
+                             blocks.cells, self.cell_features, self.min_points, self.noise, self.workers, self.stride,
                              self.tiles, self.latents, self.weights)
 
     def encode_points(self, blocks: FrameBlocks, starts: NDArray[np.int32], samples: NDArray[np.float32],
@@ -91,7 +91,7 @@ class Regressor:
                               self.tiles, self.latents, self.weights)
 
     def query(self, points: NDArray, blend: bool, reach: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Decoded values (N, c) and where a voxel covers (N,) the points (N, 3) world [m] (Eq. 7); `reach` as the kernel has it."""
+        """Decoded values (N, c) and where a voxel covers (N,), at points (N, 3) world [m] (Eq. 7); `reach` as in the kernel."""
         points = np.ascontiguousarray(points, dtype=np.float32)
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"query: points must be (N, 3), got {points.shape}")
@@ -110,7 +110,7 @@ class Regressor:
 
 
 def _window_masks(margin: int) -> NDArray[np.uint32]:
-    """(27, 2): the cells of each of the 27 neighbours within `margin` cells of a voxel, as bits in the order of `mark_cells`."""
+    """(27, 2): the cells of each of the 27 neighbours within `margin` cells of a voxel, as bits as `mark_cells` has them."""
     halves = {-1: range(CELLS - margin, CELLS), 0: range(CELLS), 1: range(margin)}
     masks = np.zeros((27, 2), np.uint32)
     for o, steps in enumerate(product((-1, 0, 1), repeat=3)):

@@ -20,9 +20,10 @@ class MapSettings:
     min_points: int = 4
     """Voxels with fewer samples in a frame are left out of that frame."""
     sampling: Literal["cells", "points"] = "cells"
-    """cells: average a frame's points in 4x4x4 cells a voxel before the regression (fast); points: every point as it is (the paper)."""
+    """cells: average a frame's points in 4x4x4 cells a voxel before the regression (fast); points: every point (the paper)."""
     margin: int = 1
-    """How many cells (quarters of a voxel) around a voxel its regression takes in: 2 is the whole doubled voxel, 1 is faster."""
+    """Cells (quarters of a voxel) around a voxel that its regression takes in: 2 is the whole doubled voxel, 1 is faster;
+    sampling points always takes the whole."""
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
     """The position encoding."""
 
@@ -47,11 +48,12 @@ class SurfaceSettings(MapSettings):
     sample_distance: float = 0.15
     """Distance of the off-surface samples along the normal, in voxels (d_s)."""
     support_points: int = 4
-    """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one frame (fewer where a whole voxel has
-    few); 0: everywhere in voxels that held any."""
+    """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one frame (fewer where a whole
+    voxel has few); 0: everywhere in voxels that held any."""
 
     support_closing: int = 14
-    """Cells with at least this many of their 26 neighbours seen count as seen too, which closes pinholes; 27: none, 1: a rim all around."""
+    """Cells with at least this many of their 26 neighbours seen count as seen, which closes pinholes; 27: none, 1: a rim all
+    around."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
