@@ -238,6 +238,7 @@ def test_an_index_that_would_pass_safe_memory_is_refused(monkeypatch):
     ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
     assert grid.claim(len(keys), keys, ones, slots) == len(keys)
     monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * (len(keys) - 1))
+    monkeypatch.setattr(voxel_grid, "CHECK_EVERY", 0)
     with pytest.raises(CapacityError, match="3,375 voxels .* larger voxels or save"):
         grid.claim(len(keys), keys + 400, ones, slots)
     assert grid.count == len(keys)
@@ -248,6 +249,7 @@ def test_lone_points_that_make_no_voxel_also_count_against_safe_memory(monkeypat
     grid = VoxelGrid(rows=1, channels=1)
     blocks, rng = FrameBlocks(grid, 1, with_positions=False), np.random.default_rng(8)
     monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * 5000)
+    monkeypatch.setattr(voxel_grid, "CHECK_EVERY", 2000)
     with pytest.raises(CapacityError, match="larger voxels or save"):
         for _ in range(20):
             blocks.touch(rng.uniform(-200, 200, (1000, 3)).astype(np.float32), VS)

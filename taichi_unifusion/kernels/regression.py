@@ -33,11 +33,16 @@ def find_neighbors(
     neighbors: Ints2,  # (B, 27) block number of each neighbour, -1 where this frame does not touch it
 ):
     for b in range(blocks):
-        for o in range(27):
-            at = ti.math.clamp(row3(keys, b) + neighbor_step(o), -INDEX_HALF, INDEX_HALF - 1) + INDEX_HALF
+        for o in range(14, 27):
+            neighbors[b, o] = -1
+        neighbors[b, 13] = b
+    for b in range(blocks):
+        for o in range(13):  # the other half of them, seen from the other side
+            ijk = row3(keys, b) + neighbor_step(o)
             found = -1
-            if stamp[at] == frame:
-                found = block[at]
+            if ijk.min() >= -INDEX_HALF and ijk.max() < INDEX_HALF and stamp[ijk + INDEX_HALF] == frame:
+                found = block[ijk + INDEX_HALF]
+                neighbors[found, 26 - o] = b
             neighbors[b, o] = found
 
 

@@ -19,7 +19,7 @@ from ..kernels import voxels as kernels
 
 SPARSE_LIMIT = 1 << 30       # bytes of sparse nodes: Taichi's CPU pool fails silently somewhat above 1.6 GB
 BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16  # a 4^3 leaf with three i32 fields and its share of the nodes above it
-CHECK_EVERY = 2000           # touched voxels between two counts of the leaves, at least
+CHECK_EVERY = 100_000        # touched voxels between two counts of the leaves, at least: 0.2 GB of sparse nodes at worst
 FIRST_CAPACITY = 4096
 
 
