@@ -44,14 +44,14 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
 
     A frame without a usable pixel gives an empty cloud.
     """
-    runtime.current()
+    live = runtime.current()
     from .kernels import images as kernels
 
     settings = settings or PreprocessSettings()
     camera = frame.camera
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     raw = np.ascontiguousarray(frame.depth)
-    depth, inverse, normals = np.empty_like(raw), np.empty_like(raw), np.empty((*raw.shape, 3), np.float32)
+    depth, inverse, normals, pixels = _scratch(live, raw.shape)
     kernels.clip_depth(raw, settings.depth_min, settings.depth_max, depth)
     kernels.drop_flying_pixels(depth, settings.edge_jump, settings.edge_support, inverse)
     kernels.estimate_normals(inverse, *intrinsics, settings.normal_radius, settings.edge_jump,
@@ -64,7 +64,6 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
     points, point_normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)
     if total == 0:
         return PointCloud(points, point_normals, {name: np.empty((0, c), np.float32) for name, c in _channels(frame).items()})
-    pixels = np.empty((total, 2), np.int32)
     kernels.unproject(depth, normals, *intrinsics, (np.cumsum(counts) - counts).astype(np.int32), points, point_normals, pixels)
     attributes = {name: np.empty((total, c), np.float32) for name, c in _channels(frame).items()}
     for name, values in attributes.items():
@@ -73,6 +72,16 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
         else:
             kernels.sample_image(pixels, np.ascontiguousarray(frame.images[name]), values)
     return PointCloud(points, point_normals, attributes)
+
+
+def _scratch(live: runtime.Runtime, shape: tuple[int, int]) -> tuple:
+    """Images that only the kernels need: depth, inverse depth, normals and pixels of the points; kept on the device by size."""
+    import taichi as ti
+
+    if shape not in live.scratch:
+        live.scratch[shape] = (ti.ndarray(ti.f32, shape), ti.ndarray(ti.f32, shape), ti.ndarray(ti.f32, (*shape, 3)),
+                               ti.ndarray(ti.i32, (shape[0] * shape[1], 2)))
+    return live.scratch[shape]
 
 
 def _channels(frame: Frame) -> dict[str, int]:

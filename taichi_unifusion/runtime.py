@@ -30,7 +30,7 @@ class Runtime:
     description: str
     free_trees: list = field(default_factory=list, repr=False)  # index trees of maps that are gone: Taichi cannot free them
     trees: list = field(default_factory=lambda: [0], repr=False)
-    scratch: dict = field(default_factory=dict, repr=False)     # shape -> field that kernels of all maps use in turn
+    scratch: dict = field(default_factory=dict, repr=False)     # shape -> arrays that all use in turn
 
     def count_tree(self) -> None:
         """Note that one more index tree is made; raises CapacityError before there are more than Taichi bears."""

@@ -112,7 +112,7 @@ def touch_surfel_samples(
                 point, normal = surfel(b, cell, keys, counts, sums)
                 for s in range(offsets.shape[0]):
                     ijk = voxel_of(point + offsets[s] * normal)
-                    if in_range(ijk):
+                    if any(ijk != row3(keys, b)) and in_range(ijk):
                         touch(ijk, frame, stamp, block, keys, counters)
 
 
@@ -139,7 +139,9 @@ def bin_surfel_samples(
                     x = point + offsets[s] * normal
                     ijk = voxel_of(x)
                     if in_range(ijk) and normal.norm() > 0:
-                        at = block[ijk + INDEX_HALF]
+                        at = b
+                        if any(ijk != row3(keys, b)):
+                            at = block[ijk + INDEX_HALF]
                         target = cell_of(x, ijk)
                         distance = normal.dot(cell_center(target) + ijk - point)
                         count = counts[b, cell]

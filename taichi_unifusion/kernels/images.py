@@ -143,12 +143,12 @@ def unproject(
 @ti.kernel
 def sample_color(
     # in:
-    pixels: Ints2,   # (N, 2)
+    pixels: Ints2,   # (N or more, 2)
     color: Bytes3,   # (H, W, 3)
     # out:
     values: Floats2,  # (N, 3) in [0, 1]
 ):
-    for n in range(pixels.shape[0]):
+    for n in range(values.shape[0]):
         for c in ti.static(range(3)):
             values[n, c] = ti.cast(color[pixels[n, 0], pixels[n, 1], c], ti.f32) * (1.0 / 255.0)
 
@@ -156,12 +156,12 @@ def sample_color(
 @ti.kernel
 def sample_image(
     # in:
-    pixels: Ints2,    # (N, 2)
+    pixels: Ints2,    # (N or more, 2)
     image: Floats3,   # (H, W, c)
     # out:
     values: Floats2,  # (N, c)
 ):
-    for n in range(pixels.shape[0]):
+    for n in range(values.shape[0]):
         for c in range(values.shape[1]):
             values[n, c] = image[pixels[n, 0], pixels[n, 1], c]
 
