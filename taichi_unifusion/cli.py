@@ -238,6 +238,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             if debug:
                 raise
             return _report([error])
+        except OSError as error:  # our own files are FileErrors; this is standard output, on a full disk
+            if debug:
+                raise
+            return _report([FileError(f"output could not be written: {error.strerror or error}")])
 
 
 def _dispatch(argv: list[str]) -> int:

@@ -122,5 +122,5 @@ def _why_empty(frame: Frame, settings: PreprocessSettings) -> str:
         return "the depth image holds no reading at all"
     if not ((readings >= settings.depth_min) & (readings <= settings.depth_max)).any():
         return (f"all depth readings lie outside {settings.depth_min:g}..{settings.depth_max:g} m "
-                f"(median {np.median(readings):.3g} m); see preprocess.depth_min and depth_max")
+                f"(median {np.median(readings):.3g} m); is the depth scale wrong? Else see preprocess.depth_min and depth_max")
     return f"all {len(readings)} depth readings lie on edges, on grazing surfaces or too far apart"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import platform
+import sys
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from io import StringIO
@@ -66,7 +67,7 @@ def init(device: str = "auto", *, threads: int | None = None, device_memory_gb: 
     if device == "cuda" and found != "cuda":
         raise RuntimeStateError("device: CUDA was asked for but Taichi finds none; use device 'cpu' or check the NVIDIA driver")
     _runtime = Runtime(found, _describe(found, threads))
-    logger.info("Taichi %s on %s", ".".join(map(str, ti.__version__)), _runtime.description)
+    _say(f"Taichi {'.'.join(map(str, ti.__version__))} on {_runtime.description}")
     return _runtime
 
 
@@ -87,6 +88,13 @@ def synchronize() -> None:
     import taichi as ti
 
     ti.sync()
+
+
+def _say(sentence: str) -> None:
+    if logger.hasHandlers():
+        logger.info("%s", sentence)
+    else:  # a script that has set up no logging
+        print(sentence, file=sys.stderr)
 
 
 def _import_taichi():

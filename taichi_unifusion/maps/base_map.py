@@ -134,7 +134,8 @@ class BaseMap(ABC):
             settings = target.settings_type(**{**values, "encoder": EncoderSettings(**values["encoder"])})
             restored = target._restore(manifest["name"], int(manifest["channels"]), settings)
         except (KeyError, TypeError, InputError) as error:
-            raise MapCorrupt(f"{path}: its manifest does not describe a map ({error}); write it again") from error
+            raise MapCorrupt(f"{path}: its settings are not those of a map of this version of taichi_unifusion; "
+                             "integrate the frames again") from error
         restored._check_data(path, data)
         restored._fuse_data(data)
         return restored
