@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from . import runtime
 from .encoding import PositionEncoding
 from .kernels import marching_cubes as kernels
 from .kernels import query
@@ -46,15 +47,14 @@ def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float,
 
 def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
     """The mesh without connected parts of less than `min_area` square metres: mostly stray readings."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     if min_area <= 0 or not len(mesh.faces):
         return mesh
-    a, b, c = mesh.faces.T
-    links = np.concatenate([a, b]), np.concatenate([b, c])
-    links = coo_array((np.ones(len(links[0]), np.int8), links), (len(mesh.vertices),) * 2)
-    part = connected_components(links, directed=False)[1]
+    part, changed = np.arange(len(mesh.vertices), dtype=np.int32), np.ones(1, np.int32)
+    while changed[0]:
+        changed[0] = 0
+        kernels.join_parts(mesh.faces, part, changed)
+        runtime.synchronize()
+    a = mesh.faces[:, 0]
     corners = mesh.vertices[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     kept = np.bincount(part[a], areas)[part] >= min_area                    # (V,)

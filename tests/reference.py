@@ -454,3 +454,16 @@ def sample_image(pixels, image):
 
 def transform(points, T):
     return points @ T[:3, :3].T + T[:3, 3]
+
+
+def join_parts(faces, count):
+    """(count,) the first vertex of the connected part of every vertex."""
+    part = list(range(count))
+    for _ in range(count):
+        before = part.copy()
+        for face in faces:
+            lowest = min(part[v] for v in face)
+            for v in face:
+                part[v] = lowest
+        if part == before:
+            return np.array(part)

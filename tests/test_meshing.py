@@ -13,6 +13,8 @@ from taichi_unifusion import meshing
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.kernels import marching_cubes as kernels
 from taichi_unifusion.maps import SurfaceMap
+from taichi_unifusion.meshing import drop_small_parts
+from taichi_unifusion.types import Mesh
 
 R = 4                  # samples a cube edge in these tests
 VS = 0.05
@@ -236,3 +238,27 @@ def test_an_empty_map_has_an_empty_mesh():
 def test_resolutions_out_of_range_are_refused(resolution):
     with pytest.raises(InputError, match="resolution must lie in 1..32"):
         SurfaceMap().extract_mesh(resolution)
+
+
+def test_join_parts_equals_its_twin():
+    """Random triangles over many vertices, in several parts: every vertex ends with the first vertex of its part."""
+    rng = np.random.default_rng(5)
+    faces = rng.integers(0, 400, (230, 3)).astype(np.int32)
+    part, changed = np.arange(400, dtype=np.int32), np.ones(1, np.int32)
+    while changed[0]:
+        changed[0] = 0
+        kernels.join_parts(faces, part, changed)
+    np.testing.assert_array_equal(part, reference.join_parts(faces, 400))
+    assert len(set(part.tolist())) > 10
+
+
+def test_small_parts_are_dropped_and_the_rest_is_untouched():
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    vertices = np.concatenate([0.01 * square, square + 2])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
+    mesh = Mesh(vertices, faces, np.tile(np.float32([0, 0, 1]), (8, 1)), {"x": np.arange(8, dtype=np.float32)[:, None]})
+    large = drop_small_parts(mesh, 0.001)
+    np.testing.assert_array_equal(large.vertices, vertices[4:])
+    np.testing.assert_array_equal(large.faces, faces[:2])
+    np.testing.assert_array_equal(large.attributes["x"][:, 0], np.arange(4, 8))
+    assert drop_small_parts(mesh, 0) is mesh and len(drop_small_parts(mesh, 2).faces) == 0

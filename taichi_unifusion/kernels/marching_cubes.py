@@ -21,7 +21,7 @@ def sample_at(q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.templ
 def cell_case(q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.template(), sdf: ti.template()) -> ti.i32:
     """Bit o set where corner o (x slowest) lies behind the surface; 0, no surface, where a corner is unknown."""
     case, known = 0, True
-    for o in ti.static(range(8)):
+    for o in range(8):
         cube, s = sample_at(q, ijk + ti.Vector([o // 4, o // 2 % 2, o % 2]), resolution, upper)
         value = UNKNOWN
         if cube >= 0:
@@ -107,11 +107,12 @@ def place_vertices(
         for s in range(sdf.shape[1]):
             first[q, s] = v
             ijk = ti.Vector([s // (resolution * resolution), s // resolution % resolution, s % resolution])
-            for d in ti.static(range(3)):
+            for d in range(3):
                 if edges[q, s] >> d & 1:
-                    cube, other = sample_at(q, ijk + ti.Vector.unit(3, d, ti.i32), resolution, upper)
+                    along = ti.Vector([d == 0, d == 1, d == 2])
+                    cube, other = sample_at(q, ijk + ti.cast(along, ti.i32), resolution, upper)
                     a, b = sdf[q, s], sdf[cube, other]
-                    x = (ti.cast(ijk, ti.f32) + ti.Vector.unit(3, d, ti.f32) * (a / (a - b))) / resolution - 0.5
+                    x = (ti.cast(ijk, ti.f32) + ti.cast(along, ti.f32) * (a / (a - b))) / resolution - 0.5
                     for k in ti.static(range(3)):
                         vertices[v, k] = (keys[q, k] + x[k]) * voxel_size
                     v += 1
@@ -138,7 +139,7 @@ def emit_triangles(
             case = ti.cast(cases[q, c], ti.i32)
             ijk = ti.Vector([c // (resolution * resolution), c // resolution % resolution, c % resolution])
             for t in range(triangle_counts[case]):
-                for k in ti.static(range(3)):
+                for k in range(3):
                     e = triangle_edges[case, 3 * t + k]
                     cube, s = sample_at(q, ijk + row3(corner_edges, e), resolution, upper)
                     vertex = first[cube, s]
@@ -163,3 +164,27 @@ def sum_normals(
         for k in ti.static(range(3)):
             for d in ti.static(range(3)):
                 ti.atomic_add(normals[faces[f, k], d], ti.cast(ti.round(n[d]), ti.i32))
+
+
+@ti.kernel
+def join_parts(
+    # in:
+    faces: Ints2,    # (F, 3)
+    # in and out:
+    part: Ints1,     # (V,) a vertex of the same connected part, in the end the first of them all
+    # out:
+    changed: Ints1,  # [0] = 1 unless this was the last round
+):
+    for f in range(faces.shape[0]):  # the faces' corners take over the lowest number among them, also at their roots
+        a, b, c = part[faces[f, 0]], part[faces[f, 1]], part[faces[f, 2]]
+        lowest = ti.min(a, b, c)
+        if a != lowest or b != lowest or c != lowest:
+            changed[0] = 1
+            ti.atomic_min(part[a], lowest)
+            ti.atomic_min(part[b], lowest)
+            ti.atomic_min(part[c], lowest)
+    for v in range(part.shape[0]):  # then all follow their numbers to the root
+        root = part[v]
+        while part[root] != root:
+            root = part[root]
+        part[v] = root

@@ -59,14 +59,19 @@ def query_points(
     for n in range(points.shape[0]):
         x = row3(points, n) * per_meter
         total = ti.Vector([0.0] * channels)
-        weight = 0.0
+        weight, covered = 0.0, 0
         if all_within(x, INDEX_HALF - 1.0):
             corner = voxel_of(x - 0.5) if ti.static(blend) else voxel_of(x)
-            for o in range(8 if ti.static(blend) else 1):
-                ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
-                s = slot[ijk + INDEX_HALF] - 1
+            covering = ti.static(8 if blend else 1)
+            for o in range(covering + 1):
+                ijk, s = corner, -1
+                if o < covering:
+                    ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
+                    s = slot[ijk + INDEX_HALF] - 1
+                elif weight == 0 and reach > 0:
+                    s, ijk = nearest_voxel(x, reach, slot)
                 if s >= 0:
-                    t = (x - ijk - 0.5) * 0.5
+                    t = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
                     tent = 1.0
                     if ti.static(blend):
                         for d in ti.static(range(3)):
@@ -74,13 +79,8 @@ def query_points(
                         tent = ti.max(tent, 1e-6)  # on the border of the only voxel there is, its value still counts
                     total += tent * decode(rank, channels, centered, s, t, latents, anchors, projection, scale)
                     weight += tent
-            valid[n] = ti.cast(weight > 0, ti.u8)
-            if weight == 0 and reach > 0:
-                s, ijk = nearest_voxel(x, reach, slot)
-                if s >= 0:
-                    t = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
-                    total = decode(rank, channels, centered, s, t, latents, anchors, projection, scale)
-                    weight = 1.0
+                    covered += ti.cast(o < covering, ti.i32)
+        valid[n] = ti.cast(covered > 0, ti.u8)
         for c in ti.static(range(channels)):
             values[n, c] = total[c] / ti.max(weight, 1e-12)
 
