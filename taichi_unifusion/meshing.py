@@ -65,17 +65,16 @@ def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
 
 def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
     """Sorted keys (Q, 3) of the cubes that hold surface or close one that does, and their support masks (Q, 2)."""
-    data = grid.export()
-    keys = unique_rows((data.keys[:, None] + STEPS).reshape(-1, 3))
+    keys = unique_rows((grid.voxel_keys()[:, None] + STEPS).reshape(-1, 3))
     support = np.empty((len(keys), 2), np.uint32)
     if len(keys):
         query.corner_support(keys, grid.slot, grid.masks, support_closing, support)
-        keys = keys[support.any(axis=1)]
-        keys = unique_rows((keys[:, None] + STEPS).reshape(-1, 3))  # the last cells of a cube need the samples above
-        support = np.empty((len(keys), 2), np.uint32)
-        if len(keys):
-            query.corner_support(keys, grid.slot, grid.masks, support_closing, support)
-    return keys, support
+    with_surface = support.any(axis=1)
+    keys, support = keys[with_surface], support[with_surface]
+    closed = unique_rows((keys[:, None] + STEPS).reshape(-1, 3))  # the last cells of a cube need the samples above
+    closed_support = np.zeros((len(closed), 2), np.uint32)
+    closed_support[np.searchsorted(_codes(closed), _codes(keys))] = support
+    return closed, closed_support
 
 
 def unique_rows(rows: NDArray) -> NDArray[np.int32]:

@@ -114,11 +114,15 @@ class VoxelGrid:
         self.count = int(counters[0])
         return int(counters[1])
 
+    def voxel_keys(self) -> NDArray[np.int32]:
+        """(N, 3) voxel indices, in no order."""
+        return self.keys.to_numpy()[:self.count]
+
     def export(self) -> VoxelData:
         """All voxels by value, sorted by index (i, then j, then k)."""
         runtime.check_alive(self.runtime)
         n = self.count
-        keys = self.keys.to_numpy()[:n]
+        keys = self.voxel_keys()
         order = np.lexsort(keys.T[::-1]).astype(np.int32)
         data = VoxelData(np.ascontiguousarray(keys[order]), np.empty((n, self.rows, self.channels), np.float32),
                          np.empty(n, np.float32), np.empty((n, 2), np.uint32))
