@@ -106,14 +106,13 @@ def touch_surfel_samples(
     keys: Ints2,
     counters: Ints1,
 ):
-    for b in range(blocks):
-        for cell in range(BLOCK_CELLS):
-            if counts[b, cell] > 0:
-                point, normal = surfel(b, cell, keys, counts, sums)
-                for s in range(offsets.shape[0]):
-                    ijk = voxel_of(point + offsets[s] * normal)
-                    if any(ijk != row3(keys, b)) and in_range(ijk):
-                        touch(ijk, frame, stamp, block, keys, counters)
+    for b, cell in ti.ndrange(blocks, BLOCK_CELLS):  # cells, not blocks: enough of them to share out evenly
+        if counts[b, cell] > 0:
+            point, normal = surfel(b, cell, keys, counts, sums)
+            for s in range(offsets.shape[0]):
+                ijk = voxel_of(point + offsets[s] * normal)
+                if any(ijk != row3(keys, b)) and in_range(ijk):
+                    touch(ijk, frame, stamp, block, keys, counters)
 
 
 @ti.kernel
@@ -131,29 +130,28 @@ def bin_surfel_samples(
     sample_counts: Ints2,  # (B, 64) += points behind the sample
     sample_sums: Sums3,    # (B, 64, 1 [+ 3]) += their signed distance to the surfel's plane [voxels], and its normal
 ):
-    for b in range(blocks):
-        for cell in range(BLOCK_CELLS):
-            if counts[b, cell] > 0:
-                point, normal = surfel(b, cell, keys, counts, sums)
-                for s in range(offsets.shape[0]):
-                    x = point + offsets[s] * normal
-                    ijk = voxel_of(x)
-                    if in_range(ijk) and normal.norm() > 0:
-                        at = b
-                        if any(ijk != row3(keys, b)):
-                            at = block[ijk + INDEX_HALF]
-                        target = cell_of(x, ijk)
-                        distance = normal.dot(cell_center(target) + ijk - point)
-                        count = counts[b, cell]
-                        ti.atomic_add(sample_counts[at, target], count)
-                        ti.atomic_add(sample_sums[at, target, 0], ti.cast(ti.round(distance * FIXED), ti.i64) * count)
-                        if ti.static(with_normals):
-                            for d in ti.static(range(3)):
-                                along = ti.cast(ti.round(normal[d] * FIXED), ti.i64)
-                                ti.atomic_add(sample_sums[at, target, 1 + d], along * count)
-                counts[b, cell] = 0
-                for c in ti.static(range(6)):
-                    sums[b, cell, c] = ti.i64(0)
+    for b, cell in ti.ndrange(blocks, BLOCK_CELLS):  # cells, not blocks: enough of them to share out evenly
+        if counts[b, cell] > 0:
+            point, normal = surfel(b, cell, keys, counts, sums)
+            for s in range(offsets.shape[0]):
+                x = point + offsets[s] * normal
+                ijk = voxel_of(x)
+                if in_range(ijk) and normal.norm() > 0:
+                    at = b
+                    if any(ijk != row3(keys, b)):
+                        at = block[ijk + INDEX_HALF]
+                    target = cell_of(x, ijk)
+                    distance = normal.dot(cell_center(target) + ijk - point)
+                    count = counts[b, cell]
+                    ti.atomic_add(sample_counts[at, target], count)
+                    ti.atomic_add(sample_sums[at, target, 0], ti.cast(ti.round(distance * FIXED), ti.i64) * count)
+                    if ti.static(with_normals):
+                        for d in ti.static(range(3)):
+                            along = ti.cast(ti.round(normal[d] * FIXED), ti.i64)
+                            ti.atomic_add(sample_sums[at, target, 1 + d], along * count)
+            counts[b, cell] = 0
+            for c in ti.static(range(6)):
+                sums[b, cell, c] = ti.i64(0)
 
 
 @ti.kernel

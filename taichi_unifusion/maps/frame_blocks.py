@@ -11,7 +11,7 @@ from ..kernels import cells as kernels
 from ..kernels.voxels import BLOCK_CELLS, INDEX_HALF, touch_points
 from .voxel_grid import VoxelGrid
 
-CPU_CHUNK = 64  # consecutive points a thread takes: long enough for runs in one cell, short enough to balance
+CPU_CHUNK = 32  # consecutive points a thread takes: long enough for runs in one cell, short enough to balance
 
 
 class FrameBlocks:
