@@ -88,8 +88,6 @@ def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, abo
     """Write everything that a run gave, the maps first; `about` joins the metrics (which recording, which frames)."""
     folder, started = ResultsFolder(prepare_results(directory)), time.perf_counter()
     logger.info("writing to %s", folder.directory)
-    for name in (*MESH_FILES, "preview.png", "metrics.json"):  # an interruption must not leave two runs mixed
-        folder.remove(name)
     for name, saved in pipeline.maps.items():
         folder.write(f"maps/{name}.safetensors", saved.save)
     folder.write("trajectory.txt", lambda path: write_trajectory(path, run.trajectory))
