@@ -4,7 +4,7 @@ import taichi as ti
 
 from .cells import cell_index
 from .encoding import position_features
-from .voxels import BLOCK_CELLS, CELLS, INDEX_HALF, Floats1, Floats2, Floats3, Ints2, Masks2, all_within, row3, voxel_of
+from .voxels import BLOCK_CELLS, CELLS, INDEX_HALF, Floats2, Floats3, Ints2, Masks2, all_within, row3, voxel_of
 
 UNKNOWN = 1e9  # signed distance where no voxel reaches
 

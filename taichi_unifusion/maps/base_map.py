@@ -43,7 +43,6 @@ class BaseMap(ABC):
 
     def __init__(self, name: str, channels: int, settings: MapSettings, *, centered: bool, derivatives: bool) -> None:
         self.name, self.channels, self.settings = name, channels, settings
-        self._centered = centered
         self._grid = VoxelGrid(settings.encoder.rank + centered, channels)
         self._regressor = Regressor(self._grid, settings, channels=channels, centered=centered, derivatives=derivatives)
 

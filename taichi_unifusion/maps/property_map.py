@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import InputError
-from ..kernels import query
 from ..types import PointCloud
 from .base_map import BaseMap
 from .frame_blocks import FrameBlocks

@@ -133,5 +133,5 @@ class VoxelGrid:
     @property
     def memory_bytes(self) -> int:
         """Bytes that the voxels need: pools as far as they are used, and the index tree."""
-        self._leaves = int(kernels.count_leaves(self.leaf_parent)) if self.count else 0
-        return self.count * (12 + 4 + 8 + 4 * self.rows * self.channels) + self._leaves * BYTES_PER_LEAF
+        leaves = int(kernels.count_leaves(self.leaf_parent)) if self.count else 0
+        return self.count * (12 + 4 + 8 + 4 * self.rows * self.channels) + leaves * BYTES_PER_LEAF
