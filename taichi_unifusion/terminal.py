@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+DONE, FAILED = 0, 2  # exit codes
 LINE_INTERVAL = 10.0  # [s] between progress lines where there is no bar
 
 logger = logging.getLogger("taichi_unifusion")
@@ -45,6 +46,13 @@ def log_to_stderr(debug: bool = False) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.setLevel(level)
+
+
+def report(errors: Sequence[Exception]) -> int:
+    """Show errors, and return the exit code that they make."""
+    for error in errors:
+        logger.error("%s", error)
+    return FAILED if errors else DONE
 
 
 @contextmanager

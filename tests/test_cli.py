@@ -22,6 +22,7 @@ from tiny_recording import CONFIG, DEVICE, FLAGS, make_frames, write_folder
 
 import taichi_unifusion as uf
 from taichi_unifusion import cli, results
+from taichi_unifusion.commands.info import Info
 from taichi_unifusion.config import Config, dump_config, load_config
 from taichi_unifusion.io import read_mesh, read_trajectory
 from taichi_unifusion.map_files import read_map
@@ -102,7 +103,7 @@ def test_V4_interrupted_is_130(monkeypatch, capsys):
     def interrupted(options):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(cli.COMMANDS, "info", (cli.Info, interrupted))
+    monkeypatch.setitem(cli.COMMANDS, "info", (Info, interrupted))
     assert cli.main(["info", "x"]) == 130
     assert "stopped" in capsys.readouterr().err
 

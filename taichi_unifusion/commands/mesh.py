@@ -1,0 +1,58 @@
+"""`unifusion mesh`: saved maps -> mesh files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from ..config import MeshSettings
+from ..errors import FileError, InputError, UniFusionError
+from ..terminal import format_bytes, report
+
+
+@dataclass(frozen=True)
+class ExtractMesh:
+    """Extract the coloured mesh again from the saved maps of a results folder, finer or coarser."""
+
+    dir: Annotated[Positional[Path], arg(metavar="DIR")]
+    """Results folder of `unifusion reconstruct`."""
+    resolution: Annotated[int, arg(metavar="N")] = 4
+    """Cells along the edge of a surface voxel; 8 gives 4 times the triangles of 4."""
+    min_area: Annotated[float, arg(metavar="M2")] = MeshSettings.min_area
+    """Connected parts of less than this area, in square metres, are left out; 0 keeps all."""
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: DIR/mesh.ply and DIR/mesh.glb)")] = None
+    """Where to write it: .ply, .glb or .obj."""
+    device: Literal["auto", "cuda", "cpu"] = "auto"
+    """Where to compute."""
+
+
+def extract_mesh(options: ExtractMesh) -> int:
+    """Saved maps -> mesh files."""
+    from ..io import MESH_SUFFIXES, check_writable, write_mesh
+
+    files = [options.out] if options.out else [options.dir / "mesh.ply", options.dir / "mesh.glb"]
+    if files[0].suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(f"{files[0]}: a mesh is written as {', '.join(MESH_SUFFIXES)}, not as '{files[0].suffix}'")
+    maps = {path.stem: path for path in sorted((options.dir / "maps").glob("*.safetensors"))}
+    if "surface" not in maps:
+        raise FileError(f"{options.dir}: no maps/surface.safetensors here; give the results folder of `unifusion reconstruct`")
+    check_writable(files[0].parent)
+    from .. import pipeline, runtime
+    from ..maps import PropertyMap, SurfaceMap
+
+    runtime.init(options.device)
+    surface = SurfaceMap.load(maps.pop("surface"))
+    properties = {name: PropertyMap.load(path) for name, path in maps.items()}
+    mesh = pipeline.extract_mesh(surface, properties, options.resolution, options.min_area)
+    failures = []
+    for file in files:
+        try:
+            write_mesh(file, mesh)
+            print(f"{file}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, "
+                  f"{format_bytes(file.stat().st_size)}")
+        except UniFusionError as error:  # the other file may still be written
+            failures.append(error)
+    return report(failures)

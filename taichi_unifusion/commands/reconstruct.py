@@ -1,0 +1,76 @@
+"""`unifusion reconstruct`: frames -> maps -> mesh -> results folder."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from ..config import Config
+from ..datasets import Dataset
+from ..interrupts import INTERRUPTED, stop_on_signal
+from ..terminal import frame_progress, report, summarize
+from .recording import RecordingOptions
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ReconstructOptions(RecordingOptions):
+    """Turn a recording of RGB-D frames with camera poses into a coloured mesh.
+
+    Example: unifusion reconstruct 7scenes my/redkitchen --every 10 --out results/kitchen
+
+    Settings that `unifusion config --help` explains are options here too,
+
+    for example --device cpu, --surface.voxel-size 0.03 or --mesh.resolution 8.
+    """
+
+    out: Annotated[Path, arg(metavar="DIR")] = field(kw_only=True)
+    """Folder for the results; made where it does not exist."""
+    config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(default=None, kw_only=True)
+    """YAML file of settings that differ from the defaults; options given here count more."""
+    json: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
+    """Print the metrics as JSON instead of tables."""
+
+
+@dataclass(frozen=True)
+class Reconstruct(ReconstructOptions):
+    __doc__ = ReconstructOptions.__doc__
+
+    settings: Annotated[Config, arg(name="")] = field(default_factory=Config, kw_only=True)
+
+
+def reconstruct(options: Reconstruct) -> int:
+    """Frames -> maps -> mesh -> results folder."""
+    frames = options.frames()
+    from ..results import prepare_results, remove_temporaries
+
+    directory = prepare_results(options.out)
+    with stop_on_signal(clean_up=lambda: remove_temporaries(directory)) as stop:
+        return _run_and_write(options, frames, directory, stop)
+
+
+def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop: Callable[[], bool]) -> int:
+    from ..pipeline import Pipeline
+    from ..results import write_results
+
+    pipeline = Pipeline(options.settings)
+    with frame_progress(len(frames)) as on_frame:
+        run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
+    if not run.steps:
+        logger.warning("stopped before the first frame was done; nothing was written")
+        return INTERRUPTED
+    done = len(run.steps) + len(run.skipped)
+    if done < len(frames):
+        logger.warning("%s after %d of %d frames; writing what they gave", "stopped" if run.interrupted else "ended early",
+                       done, len(frames))
+    results = write_results(directory, pipeline, run, {"recording": {**options.about, "frames": len(frames)}})
+    print(json.dumps(results.metrics, indent=2) if options.json else summarize(results.metrics, results.files, directory))
+    code = report([error for error in (run.failure, *results.failures) if error])
+    return INTERRUPTED if stop() else code
