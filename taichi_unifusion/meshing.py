@@ -17,6 +17,7 @@ from . import runtime
 from .encoding import PositionEncoding
 from .kernels import marching_cubes as kernels
 from .kernels import query
+from .kernels.visibility import interpolate_evidence
 from .types import Mesh
 
 if TYPE_CHECKING:
@@ -26,10 +27,12 @@ STEPS = np.array(list(product((0, 1), repeat=3)))  # (8, 3) corners of a cube, x
 NORMAL_UNIT = float(1 << 18)                       # fixed-point one of summed normals, in squared grid spacings
 
 
-def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float, resolution: int, support_closing: int) -> Mesh:
+def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float, resolution: int, support_closing: int,
+                 min_evidence: float) -> Mesh:
     """Zero level of the blended field on `resolution`^3 cells a voxel, only where cells are supported.
 
-    A cell with `support_closing` of its 26 neighbours supported counts as supported.
+    A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map holds evidence, the mesh ends
+    on the line where evidence falls below `min_evidence`.
     """
     keys, support = _cubes(grid, support_closing)
     if not len(keys):
@@ -38,11 +41,48 @@ def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float,
     sdf = np.empty((len(keys), resolution**3), np.float32)
     query.sdf_grid(encoding.settings.rank, keys, grid.slot, grid.latents, *grid_basis(encoding, resolution), sdf)
     vertices, faces = _march(keys, upper, support, sdf, resolution, voxel_size)
+    if grid.with_evidence and len(faces):
+        evidence = np.empty(len(vertices), np.float32)
+        interpolate_evidence(vertices, 1.0 / voxel_size, grid.slot, grid.masks, grid.evidence, evidence)
+        vertices, faces = cut_mesh(vertices, faces, evidence - np.float32(min_evidence))
     sums = np.zeros((len(vertices), 3), np.int32)
     if len(faces):
         kernels.sum_normals(vertices, faces, NORMAL_UNIT * (resolution / voxel_size) ** 2, sums)
     normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1)
     return Mesh(vertices, faces, normals.astype(np.float32))
+
+
+def cut_mesh(vertices: NDArray[np.float32], faces: NDArray[np.int32], values: NDArray[np.float32]
+             ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """The part of a mesh where `values` (V,), linear on every triangle, are not negative; triangles on the border are cut."""
+    inside = values >= 0
+    corners = inside[faces].sum(axis=1)
+    if (corners == 3).all():
+        return vertices, faces
+    odd_in = _odd_first(faces[corners == 1], inside)     # a corner stays: the first
+    odd_out = _odd_first(faces[corners == 2], ~inside)   # a corner goes: the first
+    edges = np.concatenate([odd_in[:, [0, 1]], odd_in[:, [0, 2]], odd_out[:, [0, 1]], odd_out[:, [0, 2]]])
+    low, high = np.sort(edges, axis=1).astype(np.int64).T
+    cut, at = np.unique(low * len(vertices) + high, return_inverse=True)   # an edge is cut once, also between two triangles
+    a, b = cut // len(vertices), cut % len(vertices)
+    share = (values[a] / (values[a] - values[b]))[:, None]
+    on_edges = vertices[a] + share * (vertices[b] - vertices[a])
+    i, j, p, q = np.split(len(vertices) + at.reshape(-1), np.cumsum([len(odd_in), len(odd_in), len(odd_out)]))
+    rest = np.concatenate([faces[corners == 3], np.stack([odd_in[:, 0], i, j], axis=1),
+                           np.stack([p, odd_out[:, 1], odd_out[:, 2]], axis=1), np.stack([p, odd_out[:, 2], q], axis=1)])
+    return _without_unused(np.concatenate([vertices, on_edges]), rest)
+
+
+def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Faces turned, without changing their orientation, so that their one corner that is `odd` comes first."""
+    first = np.argmax(odd[faces], axis=1)[:, None]
+    return np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+
+
+def _without_unused(vertices: NDArray[np.float32], faces: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    return vertices[used], (np.cumsum(used) - 1).astype(np.int32)[faces]
 
 
 def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:

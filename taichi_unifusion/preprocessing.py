@@ -8,7 +8,10 @@ import numpy as np
 
 from . import runtime
 from .errors import InputError
-from .types import Frame, PointCloud
+from .types import DepthView, Frame, PointCloud
+
+
+FARTHEST = 1e4  # [m] readings beyond are none
 
 
 @dataclass(frozen=True)
@@ -62,8 +65,10 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
     runtime.synchronize()
     total = int(counts.sum())
     points, point_normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)
+    view = _view(frame, settings)
     if total == 0:
-        return PointCloud(points, point_normals, {name: np.empty((0, c), np.float32) for name, c in _channels(frame).items()})
+        empty = {name: np.empty((0, c), np.float32) for name, c in _channels(frame).items()}
+        return PointCloud(points, point_normals, empty, view)
     kernels.unproject(depth, normals, *intrinsics, (np.cumsum(counts) - counts).astype(np.int32), points, point_normals, pixels)
     attributes = {name: np.empty((total, c), np.float32) for name, c in _channels(frame).items()}
     for name, values in attributes.items():
@@ -71,7 +76,16 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
             kernels.sample_color(pixels, np.ascontiguousarray(frame.color), values)
         else:
             kernels.sample_image(pixels, np.ascontiguousarray(frame.images[name]), values)
-    return PointCloud(points, point_normals, attributes)
+    return PointCloud(points, point_normals, attributes, view)
+
+
+def _view(frame: Frame, settings: PreprocessSettings) -> DepthView:
+    """All of a frame's readings: those that are too far for a point still say that space before them is free."""
+    from .kernels import images as kernels
+
+    depth = np.empty_like(frame.depth)
+    kernels.clip_depth(np.ascontiguousarray(frame.depth), settings.depth_min, FARTHEST, depth)
+    return DepthView(depth, frame.camera, np.eye(4))
 
 
 def _scratch(live: runtime.Runtime, shape: tuple[int, int]) -> tuple:

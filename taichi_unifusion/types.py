@@ -115,12 +115,22 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class DepthView:
+    """From where a cloud was seen: what lies between the camera and the readings is free."""
+
+    depth: NDArray[np.float32]            # (H, W) [m]; 0: no reading
+    camera: PinholeCamera
+    T_camera_cloud: NDArray[np.float64]   # (4, 4) from the cloud's frame of reference to the camera's
+
+
+@dataclass(frozen=True)
 class PointCloud:
     """Points with unit normals towards the camera and any sampled properties, all in one frame of reference."""
 
     points: NDArray[np.float32]                # (N, 3) [m]
     normals: NDArray[np.float32] | None = None  # (N, 3) unit, towards the camera
     attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)  # name -> (N, c); "color" is RGB in [0, 1]
+    view: DepthView | None = None              # from where it was seen, if that is known
 
     def __post_init__(self) -> None:
         for name, array, columns in (("points", self.points, 3), ("normals", self.normals, 3),
@@ -146,14 +156,16 @@ class PointCloud:
         runtime.current()
         from .kernels.images import transform  # Taichi starts with the first kernel, not with the first type
 
-        T = check_rigid(T_b_a, "T_b_a").astype(np.float32)
+        T_b_a = check_rigid(T_b_a, "T_b_a")
+        T = T_b_a.astype(np.float32)
         rotation = np.hstack([T[:3, :3], np.zeros((3, 1), np.float32)])
         moved = []
         for vectors, matrix in ((self.points, np.ascontiguousarray(T[:3])), (self.normals, rotation)):
             moved.append(None if vectors is None else np.empty_like(vectors))
             if vectors is not None and len(vectors):
                 transform(np.ascontiguousarray(vectors), matrix, moved[-1])
-        return replace(self, points=moved[0], normals=moved[1])
+        view = self.view and replace(self.view, T_camera_cloud=self.view.T_camera_cloud @ np.linalg.inv(T_b_a))
+        return replace(self, points=moved[0], normals=moved[1], view=view)
 
 
 @dataclass(frozen=True)

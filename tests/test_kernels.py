@@ -7,7 +7,7 @@ from importlib import import_module
 import pytest
 import reference
 
-MODULES = ["encoding", "voxels", "cells", "regression", "query", "marching_cubes", "images"]
+MODULES = ["encoding", "voxels", "cells", "regression", "fusion", "visibility", "query", "marching_cubes", "images"]
 # Bookkeeping with no twin but a dict or a sum, in the tests named here.
 BOOKKEEPING = {"claim_slots": "test_voxels", "gather_voxels": "test_voxels", "copy_voxels": "test_voxels",
                "count_leaves": "test_voxels", "count_vertices": "test_meshing"}

@@ -8,7 +8,7 @@ import reference
 from scenes import rough
 
 from taichi_unifusion.encoding import EncoderSettings
-from taichi_unifusion.kernels import regression as kernels
+from taichi_unifusion.kernels import fusion
 from taichi_unifusion.maps import PropertyMap, SurfaceMap
 
 LATENT = 3e-4   # relative to the largest entry of F: float32 features (2e-5), amplified by solving with noise d of 0.3 and more
@@ -83,7 +83,7 @@ def test_fuse_equals_its_twin():
     old[old_weights == 0] = 0
     old_masks = rng.integers(0, 2**32, (60, 2), dtype=np.uint32)
     fused, fused_weights, fused_masks = old.copy(), old_weights.copy(), old_masks.copy()
-    kernels.fuse(rows, channels, 40, slots, latents, weights, masks, fused, fused_weights, fused_masks)
+    fusion.fuse(rows, channels, 40, slots, latents, weights, masks, 1.0, fused, fused_weights, fused_masks)
 
     def voxels(F, w, m, keys):
         return {int(k): reference.Voxel(F[n].astype(float), float(w[n]), m[n])

@@ -1,4 +1,4 @@
-"""The l x l regression of every touched voxel, and its fusion into the map (Eq. 6, 17, 18 and 19).
+"""The l x l regression of every touched voxel (Eq. 6, 17 and 18).
 
 `F = (P^T W P + d I)^-1 P^T W Y` is Eq. 6 in its primal form: P holds a row f_posi(t) for every sample in the doubled voxel, W
 the number of points behind it. The targets Y ride along as further rows of P^T, so that one Gram product gives both
@@ -147,11 +147,34 @@ def solve_voxel(
             latents[v, rank, c] = mean[c]
 
 
+@ti.func
+def keep_sums(
+    # in:
+    v: ti.i32, size: ti.template(), channels: ti.template(), centered: ti.template(), weight: ti.f32, mean: ti.template(),
+    G: ti.template(),
+    # out:
+    sums: ti.template(), weights: ti.template(),
+):
+    """What the regression of one voxel sums over its samples, in one row: P^T W P's lower half, Y^T W P, 1^T W P, Y^T W 1."""
+    k = 0
+    for i in range(size):
+        for j in range(i + 1):
+            sums[v, k] = G[i * size + j]
+            k += 1
+    for i in range(size * (channels + ti.static(int(centered)))):
+        sums[v, k] = G[size * size + i]
+        k += 1
+    for c in ti.static(range(channels)):
+        sums[v, k + c] = mean[c]
+    weights[v] = weight
+
+
 @ti.kernel
 def encode_cells(
     # in:
     rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
     derivatives: ti.template(),
+    solve: ti.template(),  # for F; else leave the sums, for `fuse_information`
     blocks: ti.i32,
     neighbors: Ints2,    # (B, 27)
     masks: Masks2,       # (B, 2) occupied cells
@@ -168,6 +191,7 @@ def encode_cells(
     tiles: ti.template(),  # (W, rows, TILE) scratch
     latents: Floats3,    # (B, l [+ 1], c) F, then the prior mean
     weights: Floats1,    # (B,) points in the doubled voxel, 0 where not encoded
+    sums: Floats2,       # (B, q) as `keep_sums`
 ):
     for i in range(workers * stride):
         if i % stride == 0:
@@ -213,7 +237,10 @@ def encode_cells(
                                 first += ti.cast(ti.math.popcnt(occupied), ti.i32)
                     if filled > 0:
                         flush(size, rows, worker, filled, tiles, G)
-                    solve_voxel(v, rank, size, rows, channels, centered, noise, weight, mean, G, latents, weights)
+                    if ti.static(solve):
+                        solve_voxel(v, rank, size, rows, channels, centered, noise, weight, mean, G, latents, weights)
+                    else:
+                        keep_sums(v, size, channels, centered, weight, mean, G, sums, weights)
 
 
 @ti.kernel
@@ -221,6 +248,7 @@ def encode_points(
     # in:
     rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
     derivatives: ti.template(),
+    solve: ti.template(),
     blocks: ti.i32,
     keys: Ints2,          # (B, 3)
     neighbors: Ints2,     # (B, 27)
@@ -234,7 +262,7 @@ def encode_points(
     noise: ti.f32,
     workers: ti.i32, stride: ti.i32,
     # out:
-    tiles: ti.template(), latents: Floats3, weights: Floats1,  # as encode_cells
+    tiles: ti.template(), latents: Floats3, weights: Floats1, sums: Floats2,  # as encode_cells
 ):
     for i in range(workers * stride):
         if i % stride == 0:
@@ -277,34 +305,7 @@ def encode_points(
                 if filled > 0:
                     flush(size, rows, worker, filled, tiles, G)
                 if weight >= minimum:
-                    solve_voxel(v, rank, size, rows, channels, centered, noise, weight, mean, G, latents, weights)
-
-
-@ti.kernel
-def fuse(
-    # in:
-    rows: ti.template(), channels: ti.template(),
-    voxels: ti.i32,
-    slots: Ints1,             # (B,) slot in the map, -1 where none
-    latents: Floats3,         # (B, r, c) F'
-    weights: Floats1,         # (B,) w'
-    masks: Masks2,            # (B, 2) support
-    # out:
-    map_latents: Floats3,     # (S, r, c) F <- (F w + F' w') / (w + w')
-    map_weights: Floats1,     # (S,) w <- w + w'
-    map_masks: Masks2,        # (S, 2) |=
-):
-    for v in range(voxels):
-        s = slots[v]
-        if s >= 0:
-            old, new = map_weights[s], weights[v]
-            share = new / (old + new) if old > 0 else 1.0  # exactly, so that a loaded map equals the saved one
-            for a in range(rows):
-                old_row = ti.Vector([map_latents[s, a, c] for c in ti.static(range(channels))])  # all reads before all writes
-                new_row = ti.Vector([latents[v, a, c] for c in ti.static(range(channels))])
-                fused = old_row + (new_row - old_row) * share
-                for c in ti.static(range(channels)):
-                    map_latents[s, a, c] = fused[c]
-            map_weights[s] = old + new
-            for half in ti.static(range(2)):
-                map_masks[s, half] = map_masks[s, half] | masks[v, half]  # `|=` would be atomic
+                    if ti.static(solve):
+                        solve_voxel(v, rank, size, rows, channels, centered, noise, weight, mean, G, latents, weights)
+                    else:
+                        keep_sums(v, size, channels, centered, weight, mean, G, sums, weights)

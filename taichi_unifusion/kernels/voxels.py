@@ -132,6 +132,23 @@ def claim_slots(
 
 
 @ti.kernel
+def find_slots(
+    # in:
+    blocks: ti.i32,
+    keys: Ints2,       # (B, 3)
+    weights: Floats1,  # (B,) 0: no voxel wanted
+    slot: ti.template(),
+    # out:
+    slots: Ints1,      # (B,) slot of each voxel, -1 where none
+    found: Ints1,      # += how many
+):
+    for b in range(blocks):
+        slots[b] = slot[row3(keys, b) + INDEX_HALF] - 1 if weights[b] > 0 else -1
+        if slots[b] >= 0:
+            ti.atomic_add(found[0], 1)
+
+
+@ti.kernel
 def gather_voxels(
     # in:
     slots: Ints1,          # (N,) slots to take
@@ -170,6 +187,41 @@ def copy_voxels(
         for a in range(latents.shape[1]):
             for c in range(latents.shape[2]):
                 new_latents[s, a, c] = latents[s, a, c]
+
+
+@ti.kernel
+def copy_rows(count: ti.i32, rows: ti.types.ndarray(ndim=2), copies: ti.types.ndarray(ndim=2)):
+    for s, q in ti.ndrange(count, rows.shape[1]):
+        copies[s, q] = rows[s, q]
+
+
+@ti.kernel
+def gather_rows(
+    # in:
+    slots: Ints1,                          # (N,) rows to take
+    rows: ti.types.ndarray(ndim=2),        # (S, q)
+    # out:
+    gathered: ti.types.ndarray(ndim=2),    # (N, q)
+):
+    for n, q in ti.ndrange(slots.shape[0], rows.shape[1]):
+        gathered[n, q] = rows[slots[n], q]
+
+
+@ti.kernel
+def release_slots(
+    # in:
+    blocks: ti.i32,
+    keys: Ints2,           # (B, 3)
+    slots: Ints1,          # (B,) -1 where none
+    map_weights: Floats1,  # (S,)
+    # out:
+    slot: ti.template(),   # = 0 for voxels without weight
+    released: Ints1,       # += how many
+):
+    for b in range(blocks):
+        if slots[b] >= 0 and map_weights[slots[b]] == 0:
+            slot[row3(keys, b) + INDEX_HALF] = 0
+            ti.atomic_add(released[0], 1)
 
 
 @ti.kernel

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..encoding import EncoderSettings
 from ..errors import InputError, MapCorrupt
-from ..kernels import regression, voxels
+from ..kernels import visibility, voxels
 from ..map_files import read_map, write_map
 from ..types import PointCloud
 from .frame_blocks import FrameBlocks
-from .regressor import Regressor
+from .regressor import Regressor, sum_count
 from .settings import MapSettings
 from .voxel_grid import VoxelData, VoxelGrid
 
@@ -41,9 +41,11 @@ class BaseMap(ABC):
     def __init_subclass__(cls) -> None:
         BaseMap.registry[cls.kind] = cls
 
-    def __init__(self, name: str, channels: int, settings: MapSettings, *, centered: bool, derivatives: bool) -> None:
+    def __init__(self, name: str, channels: int, settings: MapSettings, *, centered: bool, derivatives: bool,
+                 evidence: bool = False) -> None:
         self.name, self.channels, self.settings = name, channels, settings
-        self._grid = VoxelGrid(settings.encoder.rank + centered, channels)
+        sums = sum_count(settings.encoder.rank, channels, centered) if settings.fusion == "information" else 0
+        self._grid = VoxelGrid(settings.encoder.rank + centered, channels, evidence=evidence, sums=sums)
         self._regressor = Regressor(self._grid, settings, channels=channels, centered=centered, derivatives=derivatives)
 
     @property
@@ -53,7 +55,7 @@ class BaseMap(ABC):
 
     def __len__(self) -> int:
         """Number of voxels."""
-        return self._grid.count
+        return len(self._grid)
 
     @property
     def memory_bytes(self) -> int:
@@ -71,10 +73,29 @@ class BaseMap(ABC):
         cloud = _finite_rows(cloud, self._observed(cloud))
         if len(cloud) == 0:
             return Integration(0, 0, len(self))
-        encode = self._encode_cells if self.settings.sampling == "cells" else self._encode_points
-        blocks = encode(cloud)                       # local LIM: F', w' of every voxel that the cloud touches
+        blocks = self._encode(cloud)                 # local LIM: F', w' of every voxel that the cloud touches
         encoded = self._regressor.fuse(blocks)       # global LIM, Eq. 19
+        self._vote(cloud, 1)
         return Integration(len(cloud), encoded, len(self))
+
+    def remove(self, cloud: PointCloud) -> Integration:
+        """Take a cloud out again that was integrated, for example to integrate it at a better pose; errors as `integrate`.
+
+        Latents and weights become what they were without it, up to rounding; support for surface stays.
+        """
+        runtime.check_alive(self._grid.runtime)
+        cloud = _finite_rows(cloud, self._observed(cloud))
+        if len(cloud) == 0:
+            return Integration(0, 0, len(self))
+        self._vote(cloud, -1)
+        encoded = self._regressor.take_out(self._encode(cloud))
+        return Integration(len(cloud), encoded, len(self))
+
+    def _encode(self, cloud: PointCloud) -> FrameBlocks:
+        return self._encode_cells(cloud) if self.settings.sampling == "cells" else self._encode_points(cloud)
+
+    def _vote(self, cloud: PointCloud, sign: int) -> None:
+        """What a map learns from where the cloud was seen from; most learn nothing."""
 
     @abstractmethod
     def _observed(self, cloud: PointCloud) -> NDArray[np.float32]:
@@ -110,15 +131,17 @@ class BaseMap(ABC):
         if n:
             slots = np.empty(n, np.int32)
             self._grid.claim(n, data.keys, data.weights, slots)
-            regression.fuse(self._grid.rows, self.channels, n, slots, data.latents, data.weights, data.masks,
-                            self._grid.latents, self._grid.weights, self._grid.masks)
+            sums = np.zeros((1, 1), np.float32) if data.sums is None else data.sums
+            self._regressor.fuse_rows(n, slots, data.latents, sums, data.weights, data.masks, 1.0)
+            if data.evidence is not None:
+                visibility.add_evidence(slots, data.evidence, self._grid.evidence)
 
     def save(self, path: str | Path) -> None:
         """Write the map to one file; readable on any device. Raises FileError where that fails; an old file then stays."""
         data = self._grid.export()
-        write_map(Path(path), {"keys": data.keys, "latents": data.latents, "weights": data.weights, "masks": data.masks},
+        write_map(Path(path), {name: tensor for name, tensor in vars(data).items() if tensor is not None},
                   {"kind": self.kind, "name": self.name, "channels": self.channels, "voxels": len(self),
-                   "fusion": "mean", "settings": dataclasses.asdict(self.settings)})
+                   "settings": dataclasses.asdict(self.settings)})
 
     @classmethod
     def load(cls, path: str | Path) -> BaseMap:
@@ -127,7 +150,7 @@ class BaseMap(ABC):
         target = BaseMap.registry.get(manifest.get("kind"))
         if target is None or not issubclass(target, cls):
             raise MapCorrupt(f"{path}: holds a map of kind '{manifest.get('kind')}', not '{getattr(cls, 'kind', 'any')}'")
-        data = VoxelData(*(tensors.get(key) for key in ("keys", "latents", "weights", "masks")))
+        data = VoxelData(**{field.name: tensors.get(field.name) for field in dataclasses.fields(VoxelData)})
         try:
             values = dict(manifest["settings"])
             settings = target.settings_type(**{**values, "encoder": EncoderSettings(**values["encoder"])})
@@ -148,6 +171,10 @@ class BaseMap(ABC):
         n = -1 if data.keys is None else len(data.keys)
         wanted = {"keys": ((n, 3), np.int32), "latents": ((n, self._grid.rows, self.channels), np.float32),
                   "weights": ((n,), np.float32), "masks": ((n, 2), np.uint32)}
+        if self._grid.with_evidence:
+            wanted["evidence"] = ((n, voxels.BLOCK_CELLS), np.int8)
+        if self._grid.sum_count:
+            wanted["sums"] = ((n, self._grid.sum_count), np.float32)
         for name, (shape, dtype) in wanted.items():
             array = getattr(data, name)
             if array is None or array.shape != shape or array.dtype != dtype:
@@ -167,4 +194,4 @@ def _finite_rows(cloud: PointCloud, observed: NDArray[np.float32]) -> PointCloud
         return cloud
     rows = np.isfinite(observed).all(axis=1)
     return PointCloud(cloud.points[rows], None if cloud.normals is None else cloud.normals[rows],
-                      {name: values[rows] for name, values in cloud.attributes.items()})
+                      {name: values[rows] for name, values in cloud.attributes.items()}, cloud.view)

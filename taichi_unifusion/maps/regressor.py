@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..encoding import position_encoding
 from ..errors import InputError
-from ..kernels import query
+from ..kernels import fusion, query
 from ..kernels import regression as kernels
 from ..kernels.voxels import CELLS
 from .frame_blocks import FrameBlocks
@@ -32,6 +33,7 @@ class Regressor:
         self.rank = encoding.settings.rank
         self.size = _round_up(self.rank)
         self.rows = self.size + _round_up(channels + centered)
+        self.information = settings.fusion == "information"
         self.scale = float(np.sqrt(7.0) / encoding.settings.length_scale)
         self.anchors = _to_device((encoding.anchors * self.scale).T)
         self.projection = _to_device(encoding.projection.T)
@@ -45,6 +47,7 @@ class Regressor:
         self.latents = ti.ndarray(ti.f32, (1, 1, 1))
         self.weights = ti.ndarray(ti.f32, (1,))
         self.slots = ti.ndarray(ti.i32, (1,))
+        self.sums = ti.ndarray(ti.f32, (1, max(grid.sum_count, 1)))
 
     def _shared_tiles(self):
         """Scratch for the workers, one for all maps of a runtime; a field, because its strides are known when compiling."""
@@ -63,12 +66,21 @@ class Regressor:
             table[:, 1:, :self.rank] = 0.5 * self.encoding.gradient(t)  # t moves by 1/2 a voxel
         return table
 
+    @cached_property
+    def cell_gradients(self) -> ti.Ndarray:
+        """(4^3, 4, l): f_posi and its gradient by voxel units at the centres of a voxel's own cells."""
+        t = self.encoding.nodes(CELLS) / 2  # a voxel is the inner half of its doubled voxel
+        return _to_device(np.concatenate([self.encoding(t)[:, None], 0.5 * self.encoding.gradient(t)], axis=1))
+
     def _begin(self, blocks: FrameBlocks) -> None:
         """Make room for the results of a frame and look up the neighbours of its blocks."""
         if blocks.count > self.weights.shape[0]:
             room = blocks.count * 5 // 4
             self.neighbors = ti.ndarray(ti.i32, (room, 27))
-            self.latents = ti.ndarray(ti.f32, (room, self.grid.rows, self.channels))
+            if self.information:
+                self.sums = ti.ndarray(ti.f32, (room, self.grid.sum_count))
+            else:
+                self.latents = ti.ndarray(ti.f32, (room, self.grid.rows, self.channels))
             self.weights = ti.ndarray(ti.f32, (room,))
             self.slots = ti.ndarray(ti.i32, (room,))
         kernels.find_neighbors(self.grid.stamp, self.grid.block, blocks.frame, blocks.count, blocks.keys, self.neighbors)
@@ -77,18 +89,18 @@ class Regressor:
         """Encode from the blocks' compacted cells."""
         self._begin(blocks)
         kernels.encode_cells(self.rank, self.size, self.rows, self.channels, self.centered, self.derivatives,
-                             blocks.count, self.neighbors, blocks.masks, self.window, blocks.totals, blocks.starts,
+                             not self.information, blocks.count, self.neighbors, blocks.masks, self.window, blocks.totals, blocks.starts,
                              blocks.cells, self.cell_features, self.min_points, self.noise, self.workers, self.stride,
-                             self.tiles, self.latents, self.weights)
+                             self.tiles, self.latents, self.weights, self.sums)
 
     def encode_points(self, blocks: FrameBlocks, starts: NDArray[np.int32], samples: NDArray[np.float32],
                       targets: NDArray[np.float32]) -> None:
         """Encode from single samples (N, 3) [voxels] with targets (N, c), both sorted by block; block b has starts[b:b+2]."""
         self._begin(blocks)
         kernels.encode_points(self.rank, self.size, self.rows, self.channels, self.centered, self.derivatives,
-                              blocks.count, blocks.keys, self.neighbors, starts, samples, targets,
+                              not self.information, blocks.count, blocks.keys, self.neighbors, starts, samples, targets,
                               self.anchors, self.projection, self.scale, self.min_points, self.noise, self.workers, self.stride,
-                              self.tiles, self.latents, self.weights)
+                              self.tiles, self.latents, self.weights, self.sums)
 
     def query(self, points: NDArray, blend: bool, reach: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Decoded values (N, c) and where a voxel covers (N,), at points (N, 3) world [m] (Eq. 7); `reach` as in the kernel."""
@@ -102,11 +114,38 @@ class Regressor:
         return values, valid.astype(bool)
 
     def fuse(self, blocks: FrameBlocks) -> int:
-        """Fuse what was encoded into the map (Eq. 19), with the blocks' support; returns the number of voxels encoded."""
+        """Fuse what was encoded into the map, with the blocks' support; returns the number of voxels encoded."""
         encoded = self.grid.claim(blocks.count, blocks.keys, self.weights, self.slots)
-        kernels.fuse(self.grid.rows, self.channels, blocks.count, self.slots, self.latents, self.weights, blocks.support,
-                     self.grid.latents, self.grid.weights, self.grid.masks)
+        self.fuse_rows(blocks.count, self.slots, self.latents, self.sums, self.weights, blocks.support, 1.0)
         return encoded
+
+    def take_out(self, blocks: FrameBlocks) -> int:
+        """Undo the fusion of what was encoded; returns the number of voxels that it touched."""
+        known = self.grid.find(blocks.count, blocks.keys, self.weights, self.slots)
+        self.fuse_rows(blocks.count, self.slots, self.latents, self.sums, self.weights, self._no_support(blocks), -1.0)
+        self.grid.release(blocks.count, blocks.keys, self.slots)
+        return known
+
+    def _no_support(self, blocks: FrameBlocks):
+        """Masks without a bit: what other frames support is not known, so that support is never taken back."""
+        blocks.support.fill(0)
+        return blocks.support
+
+    def fuse_rows(self, count: int, slots, latents, sums, weights, masks, sign: float) -> None:
+        """Fuse `count` voxels into the slots of the map: by Eq. 19, or as sums of one regression over all frames."""
+        if self.information:
+            fusion.fuse_information(self.rank, self.size, self.rows, self.channels, self.centered, count, slots, sums, weights,
+                                    masks, sign, self.noise, self.grid.sums, self.grid.latents, self.grid.weights,
+                                    self.grid.masks)
+        else:
+            fusion.fuse(self.grid.rows, self.channels, count, slots, latents, weights, masks, sign, self.grid.latents,
+                        self.grid.weights, self.grid.masks)
+
+
+def sum_count(rank: int, channels: int, centered: bool) -> int:
+    """How many numbers the regression sums up for a voxel, as `keep_sums` lays them out."""
+    size = _round_up(rank)
+    return size * (size + 1) // 2 + size * (channels + centered) + channels
 
 
 def _window_masks(margin: int) -> NDArray[np.uint32]:

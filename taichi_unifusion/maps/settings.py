@@ -24,6 +24,9 @@ class MapSettings:
     margin: int = 1
     """Cells (quarters of a voxel) around a voxel that its regression takes in: 2 is the whole doubled voxel, 1 is faster;
     sampling points always takes the whole."""
+    fusion: Literal["mean", "information"] = "mean"
+    """mean: latents of frames are averaged by weight (Eq. 19); information: the regression runs over all frames at once, with
+    several times the memory."""
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
     """The position encoding."""
 
@@ -37,6 +40,7 @@ class MapSettings:
         if self.margin not in (1, 2):
             raise InputError(f"margin: must be 1 or 2 cells, got {self.margin}")
         _check_choice("sampling", self.sampling, ("cells", "points"))
+        _check_choice("fusion", self.fusion, ("mean", "information"))
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,10 @@ class SurfaceSettings(MapSettings):
     support_closing: int = 14
     """Cells with at least this many of their 26 neighbours seen count as seen, which closes pinholes; 27: none, 1: a rim all
     around."""
+    carve: bool = True
+    """Cut the mesh where more frames saw through the surface than saw it."""
+    min_evidence: float = 0.0
+    """With `carve`: keep surface that at least this many more frames saw than saw through."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,6 +71,8 @@ class SurfaceSettings(MapSettings):
             raise InputError(f"support_points: must not be negative, got {self.support_points}")
         if not 1 <= self.support_closing <= 27:
             raise InputError(f"support_closing: must lie in 1..27 neighbours, got {self.support_closing}")
+        if not -127 <= self.min_evidence <= 127:
+            raise InputError(f"min_evidence: must lie in -127..127 frames, got {self.min_evidence}")
         _check_choice("gpis", self.gpis, ("samples", "derivatives"))
 
 

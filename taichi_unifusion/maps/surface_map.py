@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import InputError
+from ..kernels import visibility
 from ..meshing import drop_small_parts, extract_mesh
 from ..types import Mesh, PointCloud
 from .base_map import BaseMap
@@ -32,7 +33,7 @@ class SurfaceMap(BaseMap):
     def __init__(self, settings: SurfaceSettings | None = None, **overrides) -> None:
         settings = dataclasses.replace(settings or SurfaceSettings(), **overrides)
         derivatives = settings.gpis == "derivatives"
-        super().__init__("surface", 1, settings, centered=False, derivatives=derivatives)
+        super().__init__("surface", 1, settings, centered=False, derivatives=derivatives, evidence=settings.carve)
         steps = (0.0,) if derivatives else (-settings.sample_distance, 0.0, settings.sample_distance)
         self._steps = np.array(steps, np.float32)  # of the samples along the normal [voxels]
         self._surfels = FrameBlocks(self._grid, 3, with_positions=True)
@@ -73,6 +74,16 @@ class SurfaceMap(BaseMap):
         self._samples.bin_support(samples, self.voxel_size, self.settings.support_points)
         return self._samples
 
+    def _vote(self, cloud: PointCloud, sign: int) -> None:
+        """Let the frame's rays vote on what they saw and what they passed through."""
+        grid, view = self._grid, cloud.view
+        if self.settings.carve and view is not None:
+            camera = view.camera
+            visibility.vote_cells(self.settings.encoder.rank, grid.count, grid.keys, grid.masks, grid.latents,
+                                  self._regressor.cell_gradients, self.voxel_size, view.depth,
+                                  camera.fx, camera.fy, camera.cx, camera.cy,
+                                  np.ascontiguousarray(view.T_camera_cloud[:3], np.float32), sign, grid.evidence)
+
     def sdf(self, points: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Signed distance (N,) [m] at points (N, 3) world [m], positive in front of the surface, and where it is known (N,)."""
         runtime.check_alive(self._grid.runtime)
@@ -89,5 +100,6 @@ class SurfaceMap(BaseMap):
         runtime.check_alive(self._grid.runtime)
         if not 1 <= resolution <= 32:
             raise InputError(f"extract_mesh: resolution must lie in 1..32 cells a voxel, got {resolution}")
-        mesh = extract_mesh(self._grid, self._regressor.encoding, self.voxel_size, resolution, self.settings.support_closing)
+        mesh = extract_mesh(self._grid, self._regressor.encoding, self.voxel_size, resolution, self.settings.support_closing,
+                            self.settings.min_evidence)
         return drop_small_parts(mesh, min_area)

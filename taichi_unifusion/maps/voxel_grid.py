@@ -43,15 +43,19 @@ class VoxelData:
     latents: NDArray[np.float32]  # (N, r, c)
     weights: NDArray[np.float32]  # (N,)
     masks: NDArray[np.uint32]     # (N, 2) support
+    evidence: NDArray[np.int8] | None = None   # (N, 64) frames for a cell minus frames against it
+    sums: NDArray[np.float32] | None = None    # (N, q) of the regression, with `fusion: information`
 
 
 class VoxelGrid:
-    """Voxels of one map: index tree and pools."""
+    """Voxels of one map: index tree and pools; `evidence` and `sums` are pools that only some maps have."""
 
-    def __init__(self, rows: int, channels: int) -> None:
+    def __init__(self, rows: int, channels: int, *, evidence: bool = False, sums: int = 0) -> None:
         self.runtime = runtime.current()
         self.rows, self.channels = rows, channels
-        self.count = 0
+        self.with_evidence, self.sum_count = evidence, sums
+        self.count = 0   # slots given out
+        self.empty = 0   # of them, those whose voxel was removed
         self.frame = 0
         self._tree = self._borrow_tree()
         self.slot, self.stamp, self.block, self.leaf_parent = self._tree
@@ -76,6 +80,8 @@ class VoxelGrid:
         self.latents = ti.ndarray(ti.f32, (capacity, self.rows, self.channels))
         self.weights = ti.ndarray(ti.f32, (capacity,))
         self.masks = ti.ndarray(ti.u32, (capacity, 2))
+        self.evidence = ti.ndarray(ti.i8, (capacity if self.with_evidence else 1, kernels.BLOCK_CELLS))
+        self.sums = ti.ndarray(ti.f32, (capacity, self.sum_count) if self.sum_count else (1, 1))
 
     def next_frame(self) -> int:
         """A new frame stamp, which makes every block number of earlier frames void."""
@@ -100,10 +106,14 @@ class VoxelGrid:
         self.note_touched(extra)
         if self.count + extra <= self.capacity:
             return
-        old = self.keys, self.latents, self.weights, self.masks
+        old, evidence, sums = (self.keys, self.latents, self.weights, self.masks), self.evidence, self.sums
         self._allocate(max(2 * self.capacity, self.count + extra))
         if self.count:
             kernels.copy_voxels(self.count, *old, self.keys, self.latents, self.weights, self.masks)
+            if self.with_evidence:
+                kernels.copy_rows(self.count, evidence, self.evidence)
+            if self.sum_count:
+                kernels.copy_rows(self.count, sums, self.sums)
 
     def claim(self, blocks: int, keys, weights, slots) -> int:
         """Fill `slots` (B,) with the slot of every block of positive weight, new or known, and -1 elsewhere; counts those."""
@@ -114,24 +124,55 @@ class VoxelGrid:
         self.count = int(counters[0])
         return int(counters[1])
 
+    def find(self, blocks: int, keys, weights, slots) -> int:
+        """Fill `slots` (B,) with the slot of every block of positive weight, -1 where the map has none; counts them."""
+        found = np.zeros(1, np.int32)
+        kernels.find_slots(blocks, keys, weights, self.slot, slots, found)
+        runtime.synchronize()
+        return int(found[0])
+
+    def release(self, blocks: int, keys, slots) -> None:
+        """Give up the voxels of `slots` that have no weight left."""
+        released = np.zeros(1, np.int32)
+        kernels.release_slots(blocks, keys, slots, self.weights, self.slot, released)
+        runtime.synchronize()
+        self.empty += int(released[0])
+
+    def __len__(self) -> int:
+        return self.count - self.empty
+
+    def _used(self) -> NDArray[np.int32]:
+        """Slots that hold a voxel."""
+        if not self.empty:
+            return np.arange(self.count, dtype=np.int32)
+        return np.flatnonzero(self.weights.to_numpy()[:self.count] > 0).astype(np.int32)
+
     def voxel_keys(self) -> NDArray[np.int32]:
         """(N, 3) voxel indices, in no order."""
-        return self.keys.to_numpy()[:self.count]
+        return self.keys.to_numpy()[self._used()]
 
     def export(self) -> VoxelData:
         """All voxels by value, sorted by index (i, then j, then k)."""
         runtime.check_alive(self.runtime)
-        n = self.count
-        keys = self.voxel_keys()
-        order = np.lexsort(keys.T[::-1]).astype(np.int32)
+        n = len(self)
+        keys, used = self.voxel_keys(), self._used()
+        order = np.lexsort(keys.T[::-1])
+        slots = np.ascontiguousarray(used[order])
         data = VoxelData(np.ascontiguousarray(keys[order]), np.empty((n, self.rows, self.channels), np.float32),
-                         np.empty(n, np.float32), np.empty((n, 2), np.uint32))
+                         np.empty(n, np.float32), np.empty((n, 2), np.uint32),
+                         np.empty((n, kernels.BLOCK_CELLS), np.int8) if self.with_evidence else None,
+                         np.empty((n, self.sum_count), np.float32) if self.sum_count else None)
         if n:
-            kernels.gather_voxels(order, self.latents, self.weights, self.masks, data.latents, data.weights, data.masks)
+            kernels.gather_voxels(slots, self.latents, self.weights, self.masks, data.latents, data.weights, data.masks)
+            if data.evidence is not None:
+                kernels.gather_rows(slots, self.evidence, data.evidence)
+            if data.sums is not None:
+                kernels.gather_rows(slots, self.sums, data.sums)
         return data
 
     @property
     def memory_bytes(self) -> int:
         """Bytes that the voxels need: pools as far as they are used, and the index tree."""
         leaves = int(kernels.count_leaves(self.leaf_parent)) if self.count else 0
-        return self.count * (12 + 4 + 8 + 4 * self.rows * self.channels) + leaves * BYTES_PER_LEAF
+        extra = kernels.BLOCK_CELLS * self.with_evidence + 4 * self.sum_count
+        return self.count * (12 + 4 + 8 + 4 * self.rows * self.channels + extra) + leaves * BYTES_PER_LEAF

@@ -1,0 +1,153 @@
+"""Evidence for the surface and against it: a frame votes in every cell that it sees or sees through.
+
+A regression extrapolates: where a surface ends, its field goes on. What ends it are rays that pass through. Every cell of a
+voxel (its 4^3 quarters) counts the frames that saw surface in it, minus those that read depth behind it.
+"""
+
+import taichi as ti
+
+from .cells import cell_center
+from .voxels import BLOCK_CELLS, CELLS, INDEX_HALF, Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, row3, voxel_of
+
+Votes2 = ti.types.ndarray(dtype=ti.i8, ndim=2)
+
+MOST_VOTES = 127       # votes that a cell can hold, for or against
+SLACK_VOXELS = 0.5     # a reading this far behind a point passes through it [voxels]...
+SLACK_NOISE = 0.004    # ...plus this much [1/m] times its depth squared: three sigma of a Kinect
+GRAZING = 0.1          # cosine; rays flatter on a surface than this cannot say that they pass through it
+ALONE = 0.35           # the surface of a cell lies within this distance of its centre [voxels]
+FLAT = 0.2             # a field with a smaller slope than this has no surface to speak of
+
+
+@ti.func
+def to_camera(x: ti.template(), T_camera_world: ti.template()):
+    """A point in world [m], in the camera's frame [m]."""
+    return ti.Vector([T_camera_world[i, 0] * x[0] + T_camera_world[i, 1] * x[1] + T_camera_world[i, 2] * x[2]
+                      + T_camera_world[i, 3] for i in ti.static(range(3))])
+
+
+@ti.func
+def read_behind(p: ti.template(), depth: ti.template(), fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32):
+    """How far behind p [m, camera] the reading of its pixel lies [m], and whether there is a reading."""
+    behind, known = 0.0, False
+    if p[2] > 0:
+        u, v = ti.round(p[0] / p[2] * fx + cx, ti.i32), ti.round(p[1] / p[2] * fy + cy, ti.i32)
+        if u >= 0 and u < depth.shape[1] and v >= 0 and v < depth.shape[0]:
+            reading = depth[v, u]
+            behind, known = reading - p[2], reading > 0
+    return behind, known
+
+
+@ti.func
+def cell_surface(rank: ti.template(), s: ti.i32, cell: ti.i32, latents: ti.template(), features: ti.template()):
+    """The point of the surface nearest to a cell's centre [voxels from the voxel's corner], its normal, and if there is one."""
+    value, slope = 0.0, ti.Vector([0.0, 0.0, 0.0])
+    for a in range(rank):
+        F = latents[s, a, 0]
+        value += features[cell, 0, a] * F
+        for d in ti.static(range(3)):
+            slope[d] += features[cell, 1 + d, a] * F
+    steep = slope.norm()
+    normal = slope / ti.max(steep, 1e-6)
+    distance = value / ti.max(steep, 1e-6)
+    return cell_center(cell) - distance * normal, normal, steep > FLAT and ti.abs(distance) < ALONE
+
+
+@ti.func
+def add_votes(evidence: ti.template(), s: ti.i32, cell: ti.i32, votes: ti.i32):
+    """Add votes to a cell, within what it can hold."""
+    total = ti.cast(evidence[s, cell], ti.i32) + votes
+    evidence[s, cell] = ti.cast(ti.math.clamp(total, -MOST_VOTES, MOST_VOTES), ti.i8)
+
+
+@ti.kernel
+def vote_cells(
+    # in:
+    rank: ti.template(),
+    voxels: ti.i32,
+    keys: Ints2,            # (S, 3)
+    masks: Masks2,          # (S, 2) cells with support
+    latents: Floats3,       # (S, l, 1)
+    features: Floats3,      # (64, 4, l) f_posi and its gradient by voxel units at the cells' centres
+    voxel_size: ti.f32,
+    depth: Floats2,         # (H, W) [m], 0: no reading
+    fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32,
+    T_camera_world: Floats2,  # (3, 4)
+    sign: ti.i32,           # 1; -1 takes the frame's votes back
+    # out:
+    evidence: Votes2,       # (S, 64) += 1 where the frame saw the cell's surface, -= 1 where it saw through the cell
+):
+    for s, half in ti.ndrange(voxels, 2):
+        ijk = row3(keys, s)
+        center = to_camera((ijk + 0.5) * voxel_size, T_camera_world)
+        z, reach = ti.max(center[2], 1e-3), 0.9 * voxel_size  # half the diagonal
+        u, v, around = center[0] / z * fx + cx, center[1] / z * fy + cy, 2.0 * reach * ti.max(fx, fy) / z
+        if center[2] > -reach and u > -around and v > -around and u < depth.shape[1] + around and v < depth.shape[0] + around:
+            supported = masks[s, half]
+            for k in range(32):
+                cell = half * 32 + k
+                x, vote = cell_center(cell), 0
+                if (supported >> ti.cast(31 - k, ti.u32)) & 1 == 0:  # nothing seen here yet, but later frames may invent some
+                    p = to_camera((ijk + x) * voxel_size, T_camera_world)
+                    behind, known = read_behind(p, depth, fx, fy, cx, cy)
+                    if known and behind > SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]:
+                        vote = -1
+                else:
+                    x, normal, found = cell_surface(rank, s, cell, latents, features)
+                    p = to_camera((ijk + x) * voxel_size, T_camera_world)
+                    behind, known = read_behind(p, depth, fx, fy, cx, cy)
+                    if found and known:
+                        along = ti.Vector([T_camera_world[i, 0] * normal[0] + T_camera_world[i, 1] * normal[1]
+                                           + T_camera_world[i, 2] * normal[2] for i in ti.static(range(3))])
+                        cosine = ti.max(ti.abs(along.dot(p)) / p.norm(), 0.02)
+                        pixel = p[2] / fx * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine  # depth across one pixel
+                        slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2] + pixel
+                        if behind > slack:
+                            vote = -1 if cosine > GRAZING else 0
+                        elif behind > -slack:
+                            vote = 1
+                if vote != 0:
+                    add_votes(evidence, s, cell, sign * vote)
+
+
+@ti.kernel
+def add_evidence(
+    # in:
+    slots: Ints1,          # (N,)
+    evidence: Votes2,      # (N, 64)
+    # out:
+    map_evidence: Votes2,  # (S, 64) += evidence
+):
+    for n, cell in ti.ndrange(slots.shape[0], BLOCK_CELLS):
+        add_votes(map_evidence, slots[n], cell, ti.cast(evidence[n, cell], ti.i32))
+
+
+@ti.kernel
+def interpolate_evidence(
+    # in:
+    points: Floats2,     # (N, 3) world [m]
+    per_meter: ti.f32,
+    slot: ti.template(),
+    masks: Masks2,       # (S, 2)
+    evidence: Votes2,    # (S, 64)
+    # out:
+    values: Floats1,     # (N,) between the centres of the cells with support around the point; 0 where there is none
+):
+    for n in range(points.shape[0]):
+        x = row3(points, n) * (per_meter * CELLS) - 0.5
+        corner = voxel_of(x)
+        part = x - corner
+        total, weight = 0.0, 0.0
+        for o in range(8):
+            step = ti.Vector([o // 4, o // 2 % 2, o % 2])
+            at = corner + step
+            s = slot[ti.math.clamp(at >> 2, -INDEX_HALF, INDEX_HALF - 1) + INDEX_HALF] - 1
+            if s >= 0:
+                cell = ((at[0] & 3) * CELLS + (at[1] & 3)) * CELLS + (at[2] & 3)
+                if (masks[s, cell // 32] >> ti.cast(31 - cell % 32, ti.u32)) & 1 != 0:
+                    tent = 1.0
+                    for d in ti.static(range(3)):
+                        tent *= part[d] if step[d] == 1 else 1.0 - part[d]
+                    total += tent * evidence[s, cell]
+                    weight += tent
+        values[n] = total / weight if weight > 1e-3 else 0.0
