@@ -9,6 +9,7 @@ from scenes import rough
 
 from taichi_unifusion.encoding import EncoderSettings
 from taichi_unifusion.kernels import fusion
+from taichi_unifusion.kernels.regression import TILE
 from taichi_unifusion.maps import PropertyMap, SurfaceMap
 
 LATENT = 3e-4   # relative to the largest entry of F: float32 features (2e-5), amplified by solving with noise d of 0.3 and more
@@ -58,7 +59,7 @@ def test_surface_regression_equals_the_oracle(sampling, gpis, margin):
     twin = surface_twin(target.settings, *clouds)
     assert_equal_maps(target, twin)
     assert (done.points, done.voxels, done.total_voxels) == (900, len(surface_twin(target.settings, clouds[1])), len(twin))
-    assert max(voxel.w for voxel in twin.values()) > 2 * kernels.TILE
+    assert max(voxel.w for voxel in twin.values()) > 2 * TILE
 
 
 @pytest.mark.parametrize(("name", "channels", "prior", "sampling", "margin"), [
