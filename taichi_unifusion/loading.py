@@ -16,7 +16,7 @@ def load_ahead(sequence: Sequence[Frame]) -> Iterator[Callable[[], Frame]]:
 
     Calling the loader returns the frame or raises what loading it raised.
     """
-    if not _loads_in_background(sequence):
+    if getattr(recording_of(sequence), "runs_kernels", False):  # launches from two threads must not overlap
         yield from (partial(sequence.__getitem__, i) for i in range(len(sequence)))
         return
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="load") as pool:
@@ -26,13 +26,6 @@ def load_ahead(sequence: Sequence[Frame]) -> Iterator[Callable[[], Frame]]:
                 ahead.append(pool.submit(sequence.__getitem__, i))
             if i > 0:
                 yield ahead.popleft().result
-
-
-def _loads_in_background(sequence: Sequence[Frame]) -> bool:
-    """False where loading runs kernels itself: launches from two threads must not overlap."""
-    from .datasets.synthetic import SyntheticRoom
-
-    return not isinstance(recording_of(sequence), SyntheticRoom)
 
 
 def recording_of(sequence: Sequence[Frame]) -> Sequence[Frame]:

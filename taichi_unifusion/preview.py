@@ -145,7 +145,7 @@ def _rasterize(drawable: _Drawable, camera: PinholeCamera, T_world_camera: NDArr
 
     projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(T_world_camera)[:3])
     nearest = np.empty((camera.height, camera.width), np.int64)
-    rasterize(drawable.vertices, drawable.faces, projection, near, nearest)
+    rasterize(drawable.vertices, drawable.faces, 0, projection, near, nearest)
     return nearest, projection
 
 

@@ -91,7 +91,7 @@ def rasterize(vertices, faces, T_world_camera, near):
 
     runtime.current()
     nearest = np.zeros((CAMERA.height, CAMERA.width), np.int64)
-    kernel(vertices, faces, np.ascontiguousarray(CAMERA.matrix @ np.linalg.inv(T_world_camera)[:3]), near, nearest)
+    kernel(vertices, faces, 0, np.ascontiguousarray(CAMERA.matrix @ np.linalg.inv(T_world_camera)[:3]), near, nearest)
     depth = (nearest >> 32).astype(np.int32).view(np.float32)
     return np.where(nearest == EMPTY, 0, depth), np.where(nearest == EMPTY, -1, nearest & 0xFFFFFFFF)
 

@@ -18,6 +18,7 @@ class Dataset(ABC, Sequence[Frame]):
 
     name: str
     warnings: tuple[str, ...] = ()
+    runs_kernels: bool = False  # whether loading launches kernels: those of two threads must not overlap
 
     @abstractmethod
     def __len__(self) -> int: ...

@@ -38,6 +38,8 @@ class SyntheticRoom(Dataset):
     Nothing is read: `path` is there because every format has one. Raises InputError where a size is not positive.
     """
 
+    runs_kernels = True
+
     def __init__(self, path: str | Path | None = None, *, frames: int = 60, width: int = 640, height: int = 480,
                  noise: bool = True, seed: int = 0) -> None:
         if frames < 1:

@@ -33,10 +33,10 @@ def project(projection: ti.template(), x: ti.template()):
 
 
 @ti.func
-def edge_functions(p0: ti.template(), p1: ti.template(), p2: ti.template()):
-    """Rows E with E (u, v, 1) = barycentric coordinates / depth; all 0 for a triangle seen from behind or edge-on."""
+def edge_functions(p0: ti.template(), p1: ti.template(), p2: ti.template(), two_sided: ti.i32):
+    """Rows E with E (u, v, 1) = barycentric coordinates / depth; all 0 edge-on and, unless two_sided, seen from behind."""
     det = p0.dot(p1.cross(p2))  # negative where the counter-clockwise side faces the camera
-    scale = 1.0 / det if det < 0.0 else ti.cast(0.0, ti.f64)
+    scale = 1.0 / det if det < 0.0 or (two_sided == 1 and det > 0.0) else ti.cast(0.0, ti.f64)
     return ti.Matrix.rows([p1.cross(p2) * scale, p2.cross(p0) * scale, p0.cross(p1) * scale])
 
 
@@ -64,19 +64,20 @@ def rasterize(
     # in:
     vertices: Floats2,       # (V, 3) world [m]
     faces: Ints2,            # (F, 3), counter-clockwise seen from the side that is drawn
+    two_sided: ti.i32,       # 1: both sides are drawn
     projection: Projection,
     near: ti.f64,            # [m]
     # out:
     nearest: DepthBuffer,    # (H, W)
 ):
-    """The nearest front-facing triangle at the centre of every pixel."""
+    """The nearest triangle that shows a drawn side at the centre of every pixel."""
     for v, u in nearest:
         nearest[v, u] = ti.i64(EMPTY)
     for f in range(faces.shape[0]):
         p0 = project(projection, row3(vertices, faces[f, 0]))
         p1 = project(projection, row3(vertices, faces[f, 1]))
         p2 = project(projection, row3(vertices, faces[f, 2]))
-        E = edge_functions(p0, p1, p2)
+        E = edge_functions(p0, p1, p2, two_sided)
         if ti.max(p0[2], p1[2], p2[2]) >= near and E.norm_sqr() > 0.0:
             box = image_box(p0, p1, p2, near, nearest.shape[1], nearest.shape[0])
             for v in range(box[2], box[3] + 1):
@@ -142,7 +143,7 @@ def shade_pixels(
                 f = ti.cast(nearest[v, u] & ti.i64(0xFFFFFFFF), ti.i32)
                 a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
                 E = edge_functions(project(projection, row3(vertices, a)), project(projection, row3(vertices, b)),
-                                   project(projection, row3(vertices, c)))
+                                   project(projection, row3(vertices, c)), 0)
                 w = E @ ti.Vector([ti.cast(u, ti.f64), ti.cast(v, ti.f64), ti.cast(1.0, ti.f64)])
                 w = ti.max(w, 0.0) / ti.max(w, 0.0).sum()
                 w0, w1, w2 = ti.cast(w[0], ti.f32), ti.cast(w[1], ti.f32), ti.cast(w[2], ti.f32)

@@ -134,8 +134,9 @@ def gaussians(key: ti.u32):
 @ti.kernel
 def kinect_depth(
     # in:
-    exact: ti.types.ndarray(dtype=ti.f32, ndim=2), cosine: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W)
-    closest: ti.f32,  # smallest exact depth [m]: bounds the projector's shadow
+    exact: ti.types.ndarray(dtype=ti.f32, ndim=2),   # (H, W) [m], 0 where nothing is hit
+    cosine: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W) of the angle of incidence
+    closest: ti.f32,  # smallest exact depth of a hit [m]: bounds the projector's shadow
     seed: ti.i32, frame: ti.i32, fx: ti.f32,
     # out:
     depth: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W) [m] in whole millimetres, 0 where no reading
@@ -156,7 +157,7 @@ def kinect_depth(
         reach = ti.min(ti.cast(baseline_focal * (1.0 / closest - 1.0 / ti.max(z, closest)), ti.i32), width - 1 - x)
         k = 1
         while k <= reach:  # an occluder k pixels to the right hides the point from the projector on that side
-            if exact[y, x + k] * (baseline_focal + k * z) <= baseline_focal * z:
+            if exact[y, x + k] > 0.0 and exact[y, x + k] * (baseline_focal + k * z) <= baseline_focal * z:
                 lit = 0
                 k = reach
             k += 1

@@ -1,0 +1,219 @@
+"""A textured triangle scene from a file (GLB, OBJ, PLY), as the arrays that the renderer's kernels read.
+
+Opaque surfaces only, drawn from both sides: alpha is ignored. Base colour textures repeat; other maps of a material are not used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import runtime
+from ..errors import CapacityError, DatasetError, MissingDependency, UniFusionError
+from ..types import Mesh, PinholeCamera
+
+NEAR_PLANE = 0.02                   # [m] nothing nearer is drawn
+LIGHT = (0.36, 0.24, 0.9)           # towards the light, world; not unit
+BACKGROUND = (0.72, 0.80, 0.88)     # RGB in [0, 1] where a ray leaves the scene
+GREY = 178                          # of 255: a mesh without any colour
+MAX_TEXELS = 2**31 // 3             # an array of Taichi holds at most 2^31 - 1 numbers
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera sees at the pixels' centres; colour is the mean over the pixel."""
+
+    depth: NDArray[np.float32]    # (H, W) [m], 0 where nothing is hit
+    color: NDArray[np.uint8]      # (H, W, 3) RGB
+    object: NDArray[np.int32]     # (H, W) row of object_names, -1 where nothing is hit
+    cosine: NDArray[np.float32]   # (H, W) of the angle of incidence
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedScene:
+    """Triangles with texture coordinates, textures with their mip levels, and which object each triangle belongs to."""
+
+    vertices: NDArray[np.float32]      # (V, 3) world [m]
+    colors: NDArray[np.float32]        # (V, 3) RGB in [0, 1]: vertex colour times base colour
+    faces: NDArray[np.int32]           # (F, 3)
+    corners: NDArray[np.float32]       # (F, 6) texture coordinates of the corners, right and down
+    face_texture: NDArray[np.int32]    # (F,) -1: none
+    face_object: NDArray[np.int32]     # (F,)
+    object_names: tuple[str, ...]
+    textures: tuple[NDArray[np.uint8], ...]  # (h, w, 3) RGB each
+
+    def mesh(self) -> Mesh:
+        """The exact surface, hidden parts included."""
+        return Mesh(self.vertices, self.faces)
+
+    def render(self, camera: PinholeCamera, T_world_camera: NDArray) -> View:
+        """Depth, colour and objects that `camera` sees from T_world_camera."""
+        on_device = self._on_device
+        import taichi as ti
+
+        from ..kernels.texturing import SAMPLES, shade_textured
+
+        finer = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
+        nearest, projection = self._rasterize(finer, T_world_camera)
+        color = np.empty((camera.height, camera.width, 3), np.uint8)
+        light = np.array(LIGHT) / np.linalg.norm(LIGHT)
+        shade_textured(on_device.vertices, on_device.colors, on_device.faces, on_device.corners, on_device.face_texture,
+                       on_device.textures, on_device.levels, on_device.texels, projection, ti.math.vec3(light),
+                       ti.math.vec3(BACKGROUND), nearest, color)
+        return View(color=color, **self._surfaces(camera, T_world_camera))
+
+    def render_depth(self, camera: PinholeCamera, T_world_camera: NDArray) -> NDArray[np.float32]:
+        """Depth (H, W) [m] alone, 0 where nothing is hit."""
+        return self._surfaces(camera, T_world_camera)["depth"]
+
+    def render_objects(self, camera: PinholeCamera, T_world_camera: NDArray) -> NDArray[np.int32]:
+        """Object (H, W) alone, row of object_names, -1 where nothing is hit."""
+        return self._surfaces(camera, T_world_camera)["object"]
+
+    def _rasterize(self, camera: PinholeCamera, T_world_camera: NDArray) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Depth buffer (H, W) and projection (3, 4) as in kernels/raster.py."""
+        on_device = self._on_device
+        from ..kernels.raster import rasterize
+
+        projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(T_world_camera)[:3])
+        nearest = np.empty((camera.height, camera.width), np.int64)
+        rasterize(on_device.vertices, on_device.faces, 1, projection, NEAR_PLANE, nearest)
+        return nearest, projection
+
+    def _surfaces(self, camera: PinholeCamera, T_world_camera: NDArray) -> dict[str, NDArray]:
+        """Depth, cosine and object of every pixel."""
+        nearest, _ = self._rasterize(camera, T_world_camera)
+        import taichi as ti
+
+        from ..kernels.texturing import read_surfaces
+
+        depth, cosine = (np.empty(nearest.shape, np.float32) for _ in range(2))
+        objects = np.empty(nearest.shape, np.int32)
+        read_surfaces(self._on_device.vertices, self._on_device.faces, self._on_device.face_object, ti.Matrix(T_world_camera),
+                      ti.math.vec4(camera.fx, camera.fy, camera.cx, camera.cy), nearest, depth, cosine, objects)
+        return {"depth": depth, "cosine": cosine, "object": objects}
+
+    @cached_property
+    def _on_device(self) -> SimpleNamespace:
+        """The arrays that kernels take, textures with all their mip levels, moved to the device once."""
+        runtime.current()  # before Taichi is imported: it says what it starts
+        import taichi as ti
+
+        def move(array: NDArray, dtype):
+            kept = ti.ndarray(dtype, array.shape)
+            kept.from_numpy(array)
+            return kept
+
+        levels, texels, rows = [], [], []
+        offset = 0
+        for texture in self.textures or (np.zeros((1, 1, 3), np.uint8),):  # kernels take no empty arrays
+            pyramid = mip_levels(texture)
+            rows.append((len(levels), len(pyramid)))
+            for level in pyramid:
+                levels.append((offset, level.shape[1], level.shape[0]))
+                texels.append(level.reshape(-1, 3))
+                offset += len(texels[-1])
+        if offset > MAX_TEXELS:
+            raise CapacityError(f"the scene's textures have {offset:,} texels, more than {MAX_TEXELS:,}; make them smaller")
+        return SimpleNamespace(
+            **{name: move(getattr(self, name), ti.f32) for name in ("vertices", "colors", "corners")},
+            **{name: move(getattr(self, name), ti.i32) for name in ("faces", "face_texture", "face_object")},
+            textures=move(np.array(rows, np.int32), ti.i32), levels=move(np.array(levels, np.int32), ti.i32),
+            texels=move(np.concatenate(texels), ti.u8))
+
+
+def mip_levels(texture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    """The texture and its means at half the size, a quarter, ... down to one texel."""
+    levels = [texture]
+    while max(levels[-1].shape[:2]) > 1:
+        height, width = (max(1, size // 2) for size in levels[-1].shape[:2])
+        levels.append(cv2.resize(levels[-1], (width, height), interpolation=cv2.INTER_AREA))
+    return levels
+
+
+# Reading
+
+
+def load_scene(path: str | Path) -> TexturedScene:
+    """The scene in a GLB, glTF, OBJ or PLY file, one object a placed mesh; DatasetError where it holds no triangle."""
+    try:
+        import trimesh
+        from PIL import Image  # noqa: F401  without it trimesh leaves textures out, silently
+    except ImportError:
+        raise MissingDependency(f"{path}: reading a scene needs trimesh and Pillow: pip install trimesh pillow") from None
+    try:
+        scene = trimesh.load(str(path), force="scene", process=False)
+        placed = [(name, *scene.graph[name]) for name in scene.graph.nodes_geometry]
+        parts = [(name, T, scene.geometry[key]) for name, T, key in placed if hasattr(scene.geometry[key], "faces")]
+        return _assemble(path, parts)
+    except UniFusionError:
+        raise
+    except Exception as error:  # a damaged file fails anywhere in its parser
+        raise DatasetError(f"{path}: not a scene that can be read ({type(error).__name__}: {error})") from error
+
+
+def _assemble(path: str | Path, parts: Sequence[tuple[str, NDArray, Any]]) -> TexturedScene:
+    """One scene of (name, T_world_mesh, trimesh.Trimesh)."""
+    parts = [part for part in parts if len(part[2].faces)]
+    if not parts:
+        raise DatasetError(f"{path}: there are no triangles in it")
+    textures: dict[bytes, int] = {}
+    images: list[NDArray[np.uint8]] = []
+    arrays: dict[str, list[NDArray]] = {name: [] for name in ("vertices", "colors", "faces", "corners", "face_texture")}
+    base = 0
+    for _, T_world_mesh, mesh in parts:
+        vertices = mesh.vertices @ T_world_mesh[:3, :3].T + T_world_mesh[:3, 3]
+        if not np.isfinite(vertices).all():
+            raise DatasetError(f"{path}: a vertex is not finite")
+        faces = np.asarray(mesh.faces)
+        look = _look_of(mesh)
+        texture = -1
+        if look.image is not None and look.uv is not None:
+            key = hashlib.sha256(look.image.tobytes()).digest() + bytes(str(look.image.shape), "ascii")
+            texture = textures.setdefault(key, len(textures))
+            if texture == len(images):
+                images.append(look.image)
+        uv = np.zeros((len(vertices), 2)) if look.uv is None else look.uv
+        arrays["vertices"].append(vertices.astype(np.float32))
+        arrays["colors"].append(look.colors)
+        arrays["faces"].append((faces + base).astype(np.int32))
+        arrays["corners"].append(uv[faces].reshape(-1, 6).astype(np.float32))
+        arrays["face_texture"].append(np.full(len(faces), texture, np.int32))
+        base += len(vertices)
+    owner = np.repeat(np.arange(len(parts), dtype=np.int32), [len(mesh.faces) for _, _, mesh in parts])
+    return TexturedScene(**{name: np.ascontiguousarray(np.concatenate(list_)) for name, list_ in arrays.items()},
+                         face_object=owner, object_names=tuple(name for name, _, _ in parts), textures=tuple(images))
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What a mesh looks like: colour factors (V, 3) and, if it has one, a texture with coordinates right and down."""
+
+    colors: NDArray[np.float32]
+    image: NDArray[np.uint8] | None = None
+    uv: NDArray[np.float64] | None = None
+
+
+def _look_of(mesh: Any) -> _Look:
+    visual = mesh.visual
+    if visual.kind != "texture":
+        colors = np.asarray(visual.vertex_colors)[:, :3] if visual.kind else np.full((len(mesh.vertices), 3), GREY)
+        return _Look(np.ascontiguousarray(colors / 255.0, np.float32))
+    material = visual.material
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    factor = getattr(material, "baseColorFactor", None)
+    if factor is None and image is None:
+        factor = getattr(material, "main_color", None)
+    factor = np.full(3, 255) if factor is None else np.asarray(factor)[:3]
+    colors = np.tile((factor / 255.0).astype(np.float32), (len(mesh.vertices), 1))
+    uv = None if visual.uv is None else np.asarray(visual.uv, float)[:, :2] * (1, -1) + (0, 1)  # trimesh's v runs up
+    return _Look(colors, None if image is None else np.asarray(image.convert("RGB")), uv)
