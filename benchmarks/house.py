@@ -69,7 +69,7 @@ def read_classes(path: str | Path) -> dict[str, str]:
 
 
 def trajectory(name: str) -> Trajectory:
-    """The closed path `name` of PATHS at a hand's even speed, at most STEP and TURN a frame; the last frame is next to the first."""
+    """The closed path `name` of PATHS at a hand's even speed, at most STEP and TURN a frame, from the last to the first too."""
     if name not in PATHS:
         raise InputError(f"house: path '{name}' is unknown; there are {', '.join(PATHS)}")
     t = np.linspace(0, 1, DENSITY * len(PATHS[name]) + 1)

@@ -28,8 +28,8 @@ __all__ = ["FORMATS", "Dataset", "DatasetView", "open_dataset"]
 def open_dataset(format: str, path: str | Path | None = None, **options) -> Dataset:
     """Open the recording at `path`; frames are read when indexed.
 
-    Every format but "synthetic" takes `depth_scale` (units a metre), `camera` (a PinholeCamera of the depth images) and
-    `drop_alpha`; "tum" and "folder" also `max_difference` [s]. Raises DatasetError for an unknown format, a path that does not
+    Recordings take `depth_scale` (units a metre), `camera` (a PinholeCamera of the depth images) and `drop_alpha`, "tum" and
+    "folder" also `max_difference` [s]; "synthetic" and "scene" are rendered and have options of their own. Raises DatasetError for an unknown format, a path that does not
     exist or holds no such recording, InputError for an unknown option.
     """
     if format not in FORMATS:

@@ -20,8 +20,8 @@ from .textured_scene import TexturedScene, View, load_scene
 class SceneDataset(Dataset):
     """Views of a scene from the poses of a trajectory; a frame is a function of its index, the scene and the seed alone.
 
-    `noise` gives a Kinect's depth instead of the exact one, `seed` changes the noise and nothing else. `classes` names the class
-    of objects; one that it leaves out is its own class.
+    `noise` gives a Kinect's depth instead of the exact one, `seed` changes the noise and nothing else. `classes` names the
+    class of objects; one that it leaves out is its own class.
     """
 
     runs_kernels = True

@@ -1,6 +1,6 @@
 """A textured triangle scene from a file (GLB, OBJ, PLY), as the arrays that the renderer's kernels read.
 
-Opaque surfaces only, drawn from both sides: alpha is ignored. Base colour textures repeat; other maps of a material are not used.
+Opaque surfaces only, drawn from both sides: alpha is ignored. Textures repeat; of a material only its base colour is used.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import CapacityError, DatasetError, MissingDependency, UniFusionError
-from ..types import Mesh, PinholeCamera
+from ..types import Mesh, PinholeCamera, check_rigid
 
 NEAR_PLANE = 0.02                   # [m] nothing nearer is drawn
 LIGHT = (0.36, 0.24, 0.9)           # towards the light, world; not unit
@@ -56,7 +56,7 @@ class TexturedScene:
         return Mesh(self.vertices, self.faces)
 
     def render(self, camera: PinholeCamera, T_world_camera: NDArray) -> View:
-        """Depth, colour and objects that `camera` sees from T_world_camera."""
+        """Depth, colour and objects that `camera` sees from T_world_camera; PoseError if that is no rigid transform."""
         on_device = self._on_device
         import taichi as ti
 
@@ -84,7 +84,7 @@ class TexturedScene:
         on_device = self._on_device
         from ..kernels.raster import rasterize
 
-        projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(T_world_camera)[:3])
+        projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(check_rigid(T_world_camera))[:3])
         nearest = np.empty((camera.height, camera.width), np.int64)
         rasterize(on_device.vertices, on_device.faces, 1, projection, NEAR_PLANE, nearest)
         return nearest, projection
@@ -152,7 +152,7 @@ def load_scene(path: str | Path) -> TexturedScene:
         raise MissingDependency(f"{path}: reading a scene needs trimesh and Pillow: pip install trimesh pillow") from None
     try:
         scene = trimesh.load(str(path), force="scene", process=False)
-        placed = [(name, *scene.graph[name]) for name in scene.graph.nodes_geometry]
+        placed = [(name, *scene.graph[name]) for name in sorted(scene.graph.nodes_geometry)]  # in an order of no chance
         parts = [(name, T, scene.geometry[key]) for name, T, key in placed if hasattr(scene.geometry[key], "faces")]
         return _assemble(path, parts)
     except UniFusionError:

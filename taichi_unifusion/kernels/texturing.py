@@ -11,6 +11,7 @@ from .raster import EMPTY, DepthBuffer, Projection, depth_of, edge_functions, pr
 from .voxels import Floats2, Ints1, Ints2, row3
 
 MAX_TAPS = 8       # along the long axis of a footprint; longer ones are blurred
+SLACK = 0.05       # of a tap: a footprint that is square but for rounding takes one
 SAMPLES = 2        # per pixel and axis
 SHADE = 0.35       # how much darker a surface gets that faces away from the light
 
@@ -42,7 +43,7 @@ def sample_texture(texels: ti.template(), levels: ti.template(), first: ti.i32, 
     long = along_u if a >= b else along_v
     major = ti.max(a, b, 1e-6)
     minor = ti.abs((along_u * size).cross(along_v * size)) / major
-    taps = ti.math.clamp(ti.ceil(major / ti.max(minor, 1.0), ti.i32), 1, MAX_TAPS)
+    taps = ti.math.clamp(ti.ceil(major / ti.max(minor, 1.0) - SLACK, ti.i32), 1, MAX_TAPS)
     lod = ti.math.clamp(ti.log(ti.max(major / taps, 1.0)) * 1.442695, 0.0, count - 1.0)
     level = ti.min(ti.floor(lod, ti.i32), ti.max(count - 2, 0))
     share = lod - level
@@ -67,7 +68,8 @@ def shade_triangle(vertices: ti.template(), faces: ti.template(), colors: ti.tem
                    projection: ti.template(), light: ti.math.vec3, f: ti.i32, u: ti.f64, v: ti.f64):
     """Colour of triangle f around (u, v) of a depth buffer with SAMPLES x SAMPLES samples a pixel; RGB in [0, 1]."""
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-    p0, p1, p2 = project(projection, row3(vertices, a)), project(projection, row3(vertices, b)), project(projection, row3(vertices, c))
+    p0, p1 = project(projection, row3(vertices, a)), project(projection, row3(vertices, b))
+    p2 = project(projection, row3(vertices, c))
     E = edge_functions(p0, p1, p2, 1)
     w = corner_rows(E, u, v)
     D = w.sum()
