@@ -14,7 +14,7 @@ from taichi_unifusion.datasets import FORMATS, open_dataset
 from taichi_unifusion.errors import DatasetError, InputError
 from taichi_unifusion.types import PinholeCamera
 
-FILE_FORMATS = sorted(set(FORMATS) - {"synthetic"})
+FILE_FORMATS = sorted(set(FORMATS) - {"synthetic", "scene"})
 
 
 @pytest.mark.parametrize("wrong, right", [("7-scenes", "7scenes"), ("TUM", "tum"), ("replika", "replica"),

@@ -213,7 +213,7 @@ def test_trajectory_may_be_a_file(path, trajectory, tmp_path):
 
 
 def test_a_scene_needs_a_trajectory_and_poses_that_are_rigid(path, trajectory):
-    with pytest.raises(InputError, match="trajectory="):
+    with pytest.raises(InputError, match="--camera-path"):
         open_dataset("scene", path)
     with pytest.raises(DatasetError, match="no pose"):
         open_dataset("scene", path, trajectory=Trajectory(np.zeros(0), np.zeros((0, 4, 4))))

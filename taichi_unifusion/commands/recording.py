@@ -35,6 +35,9 @@ class RecordingOptions:
     max_difference: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint=FORMAT_DEFAULT)] = field(
         default=None, kw_only=True)
     """How far time stamps of depth, colour and pose may be apart (tum, folder)."""
+    camera_path: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(scene needs one)")] = field(
+        default=None, kw_only=True)
+    """Poses to render a scene from: lines 'timestamp tx ty tz qx qy qz qw', camera to world."""
     strict: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
     """Stop at the first frame that cannot be used, instead of skipping it."""
 
@@ -42,7 +45,7 @@ class RecordingOptions:
     def reading(self) -> dict[str, object]:
         """Options for `open_dataset`: those that were given."""
         options = {"depth_scale": self.depth_scale, "max_difference": self.max_difference,
-                   "drop_alpha": self.drop_alpha or None}
+                   "drop_alpha": self.drop_alpha or None, "trajectory": self.camera_path}
         return {name: value for name, value in options.items() if value is not None}
 
     def frames(self) -> Dataset:

@@ -18,8 +18,8 @@ FORMATS = {  # name -> module here, what opens a recording
     "replica": ("replica", "open_replica"),
     "tum": ("tum", "open_tum"),
     "scannet": ("scannet", "open_scannet"),
-    "scene": ("scene", "open_scene"),
     "folder": ("folder", "open_folder"),
+    "scene": ("scene", "open_scene"),
 }
 
 __all__ = ["FORMATS", "Dataset", "DatasetView", "open_dataset"]

@@ -71,8 +71,8 @@ def open_scene(path: str | Path, *, trajectory: str | Path | Trajectory | None =
                noise: bool = True, seed: int = 0, classes: Mapping[str, str] | None = None) -> SceneDataset:
     """Render the scene file at `path` along `trajectory`, a Trajectory or a file in TUM's format."""
     if trajectory is None:
-        raise InputError(f"{path}: a scene has no camera of its own; give trajectory=, a file of lines "
-                         "'timestamp tx ty tz qx qy qz qw' (camera to world, metres)")
+        raise InputError(f"{path}: a scene has no cameras of its own; give a file of poses, lines 'timestamp tx ty tz qx qy qz "
+                         "qw', camera to world: trajectory=, or --camera-path on the command line")
     poses = trajectory if isinstance(trajectory, Trajectory) else read_trajectory(trajectory)
     if not len(poses):
         raise DatasetError(f"{trajectory}: there is no pose in it")

@@ -147,9 +147,8 @@ def load_scene(path: str | Path) -> TexturedScene:
     """The scene in a GLB, glTF, OBJ or PLY file, one object a placed mesh; DatasetError where it holds no triangle."""
     try:
         import trimesh
-        from PIL import Image  # noqa: F401  without it trimesh leaves textures out, silently
     except ImportError:
-        raise MissingDependency(f"{path}: reading a scene needs trimesh and Pillow: pip install trimesh pillow") from None
+        raise MissingDependency(f"{path}: reading a scene needs trimesh: pip install trimesh") from None
     try:
         scene = trimesh.load(str(path), force="scene", process=False)
         placed = [(name, *scene.graph[name]) for name in sorted(scene.graph.nodes_geometry)]  # in an order of no chance
