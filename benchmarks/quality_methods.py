@@ -1,0 +1,130 @@
+"""Reconstructions to compare: ours under a configuration, and the TSDF of Open3D's VoxelBlockGrid with colour."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from quality_scenes import DEPTH_RANGE
+
+from taichi_unifusion import Config, Pipeline, load_config
+from taichi_unifusion.errors import InputError
+from taichi_unifusion.types import Frame, Mesh
+
+PAPER = Path(__file__).resolve().parents[1] / "configs" / "paper.yaml"
+TRUNCATION, MIN_WEIGHT = 8.0, 3.0  # of the TSDF: in voxels (Open3D's default), and frames that must have seen a voxel
+BLOCK = 16                         # voxels along a TSDF block (Open3D's default)
+TSDF_BYTES = {"tsdf": 4, "weight": 4, "color": 12}    # a voxel, as float32
+LEAN_BLOCK, LEAN_BYTES = 8, 4 + 2 + 6                 # the smallest that VoxelBlockGrid can be made, at some loss
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A mesh with colour, and what it took."""
+
+    mesh: Mesh
+    color: Callable[[NDArray], NDArray] | None  # decodes colour at points; None: the mesh's vertex colours
+    surface_mb: float      # of the map
+    color_mb: float
+    lean_mb: float         # both, as small as the method can store them
+    cpu_ms: float          # of all threads, a frame: median
+    wall_ms: float         # a frame: median
+    mesh_s: float          # wall time of the extraction
+    settings: dict         # what was used
+
+
+@dataclass
+class Stopwatch:
+    """CPU and wall milliseconds of every lap."""
+
+    laps: list[tuple[float, float]]
+
+    @contextmanager
+    def lap(self) -> Iterator[None]:
+        cpu, wall = time.process_time(), time.perf_counter()
+        yield
+        self.laps.append((1e3 * (time.process_time() - cpu), 1e3 * (time.perf_counter() - wall)))
+
+    def median(self) -> tuple[float, float]:
+        """CPU and wall of a typical lap; the first two compile and allocate."""
+        return tuple(float(x) for x in np.median(self.laps[2:] or self.laps, axis=0))
+
+
+def ours(config: Config, frames: Sequence[Frame]) -> Reconstruction:
+    """The pipeline under a configuration."""
+    near, far = DEPTH_RANGE
+    config = replace(config, preprocess=replace(config.preprocess, depth_min=near, depth_max=far))
+    pipeline, watch = Pipeline(config), Stopwatch([])
+    for frame in frames:
+        with watch.lap():
+            pipeline.step(frame)  # waits for the device
+    start = time.perf_counter()
+    mesh = pipeline.extract_mesh()
+    mesh_s = time.perf_counter() - start
+    surface, color = pipeline.surface.memory_bytes / 2**20, pipeline.properties["color"].memory_bytes / 2**20
+    return Reconstruction(mesh, pipeline.properties["color"].query, surface, color, surface + color, *watch.median(), mesh_s,
+                          asdict(config))
+
+
+def tsdf(voxel_size: float, frames: Sequence[Frame]) -> Reconstruction:
+    """Open3D's VoxelBlockGrid on the raw depth, float32, with its default truncation and weight threshold."""
+    import open3d as o3d
+    from open3d.core import Device, Tensor, float32
+
+    cpu, far = Device("CPU:0"), DEPTH_RANGE[1]
+    grid = o3d.t.geometry.VoxelBlockGrid(tuple(TSDF_BYTES), (float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, 20_000, cpu)
+    K, watch = Tensor(frames[0].camera.matrix), Stopwatch([])
+    for frame in frames:
+        with watch.lap():
+            depth = o3d.t.geometry.Image(Tensor(np.where(frame.depth < DEPTH_RANGE[0], 0, frame.depth).astype(np.float32)))
+            color = o3d.t.geometry.Image(Tensor(frame.color.astype(np.float32) / 255))
+            T_camera_world = Tensor(np.linalg.inv(frame.T_world_camera))
+            blocks = grid.compute_unique_block_coordinates(depth, K, T_camera_world, 1.0, far, TRUNCATION)
+            grid.integrate(blocks, depth, color, K, K, T_camera_world, 1.0, far, TRUNCATION)
+    start = time.perf_counter()
+    extracted = grid.extract_triangle_mesh(MIN_WEIGHT)
+    mesh = Mesh(extracted.vertex.positions.numpy(), extracted.triangle.indices.numpy().astype(np.int32),
+                attributes={"color": extracted.vertex.colors.numpy()})
+    mesh_s = time.perf_counter() - start
+    voxels = grid.hashmap().size() * BLOCK**3
+    surface, color = voxels * (TSDF_BYTES["tsdf"] + TSDF_BYTES["weight"]) / 2**20, voxels * TSDF_BYTES["color"] / 2**20
+    return Reconstruction(mesh, None, surface, color, _lean_mb(grid), *watch.median(), mesh_s,
+                          {"voxel_size": voxel_size, "truncation_voxels": TRUNCATION, "min_weight": MIN_WEIGHT, "block": BLOCK})
+
+
+def _lean_mb(grid) -> float:
+    """Megabytes in blocks of 8^3 voxels that were touched, with 16-bit weight and colour."""
+    rows = grid.hashmap().active_buf_indices().numpy()
+    weight = grid.attribute("weight").numpy()[rows, ..., 0]  # (B, 16, 16, 16)
+    cells = BLOCK // LEAN_BLOCK
+    parts = weight.reshape(len(rows), cells, LEAN_BLOCK, cells, LEAN_BLOCK, cells, LEAN_BLOCK)
+    return int((parts.max(axis=(2, 4, 6)) > 0).sum()) * LEAN_BLOCK**3 * LEAN_BYTES / 2**20
+
+
+def _finer() -> Config:
+    config = Config()
+    return replace(config, surface=replace(config.surface, voxel_size=0.025))
+
+
+METHODS: dict[str, Callable[[Sequence[Frame]], Reconstruction]] = {
+    "ours": lambda frames: ours(Config(), frames),
+    "ours-2.5cm": lambda frames: ours(_finer(), frames),
+    "paper": lambda frames: ours(load_config(PAPER), frames),
+    "tsdf-1cm": partial(tsdf, 0.01),
+    "tsdf-2cm": partial(tsdf, 0.02),
+}
+
+
+def method(name: str) -> Callable[[Sequence[Frame]], Reconstruction]:
+    """A method of METHODS, or ours under the YAML file of that name."""
+    if name in METHODS:
+        return METHODS[name]
+    if Path(name).suffix in (".yaml", ".yml"):
+        return partial(ours, load_config(name))
+    raise InputError(f"method '{name}' is unknown; there are {', '.join(METHODS)}, and configurations FILE.yaml")
