@@ -5,8 +5,8 @@
     python benchmarks/quality.py --scenes kitchen --methods ours mine.yaml tsdf-1cm    ours under another configuration
 
 Prints a table; writes quality.json and, for every scene, pictures of held-out frames and of the worst regions. Surface metrics
-compare 100,000 points each way, cropped to what the cameras saw; depth and colour are those of held-out frames between the fused
-ones. Needs the extra open3d for the TSDF.
+compare 100,000 points each way, cropped to what the cameras saw; depth and colour are those of held-out frames between the
+fused ones. Needs the extra open3d for the TSDF.
 """
 
 from __future__ import annotations
@@ -95,8 +95,10 @@ def run(options: argparse.Namespace) -> dict[str, dict[str, dict]]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES), metavar="SCENE", help=", ".join(SCENES))
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), metavar="METHOD", help=f"{', '.join(METHODS)}, or FILE.yaml")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES), metavar="SCENE",
+                        help=", ".join(SCENES))
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), metavar="METHOD",
+                        help=f"{', '.join(METHODS)}, or FILE.yaml")
     parser.add_argument("--frames", type=int, help="about how many frames to fuse (default: every 5th of the house, 30, 60)")
     parser.add_argument("--data", type=Path, default=DATA, help=f"folder of the recordings (default: {DATA})")
     parser.add_argument("--threads", type=int, help="CPU threads of Taichi (default: all)")

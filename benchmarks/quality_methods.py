@@ -18,7 +18,7 @@ from taichi_unifusion.errors import InputError
 from taichi_unifusion.types import Frame, Mesh
 
 PAPER = Path(__file__).resolve().parents[1] / "configs" / "paper.yaml"
-TRUNCATION, MIN_WEIGHT = 8.0, 3.0  # of the TSDF: in voxels (Open3D's default), and frames that must have seen a voxel
+TRUNCATION, MIN_WEIGHT = 6.0, 1.0  # of the TSDF: in voxels, and frames that must have seen a voxel
 BLOCK = 16                         # voxels along a TSDF block (Open3D's default)
 TSDF_BYTES = {"tsdf": 4, "weight": 4, "color": 12}    # a voxel, as float32
 LEAN_BLOCK, LEAN_BYTES = 8, 4 + 2 + 6                 # the smallest that VoxelBlockGrid can be made, at some loss
@@ -73,7 +73,7 @@ def ours(config: Config, frames: Sequence[Frame]) -> Reconstruction:
 
 
 def tsdf(voxel_size: float, frames: Sequence[Frame]) -> Reconstruction:
-    """Open3D's VoxelBlockGrid on the raw depth, float32, with its default truncation and weight threshold."""
+    """Open3D's VoxelBlockGrid on the raw depth, float32, under the truncation and threshold that served it best."""
     import open3d as o3d
     from open3d.core import Device, Tensor, float32
 

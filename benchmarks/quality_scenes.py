@@ -15,7 +15,7 @@ from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.types import Frame, Mesh
 
 DEPTH_RANGE = (0.4, 5.0)  # [m] readings that are fused, and compared with
-HELD_OUT = 30             # frames at most that are compared with
+HELD_OUT = 16             # frames that are compared with, unless a scene says otherwise
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def synthetic(data: Path, frames: int | None) -> Scene:
 def kitchen(data: Path, frames: int | None) -> Scene:
     """7-Scenes RedKitchen 0-299: every 10th is fused, the 5th in between compared with."""
     recording = open_dataset("7scenes", data / "7scenes-redkitchen")[:300]
-    return _of_recording("kitchen", recording, recording, frames or 30, None)
+    return _of_recording("kitchen", recording, recording, frames or 30, None, held_out=30)
 
 
 def house(path: str, data: Path, frames: int | None) -> Scene:
@@ -61,8 +61,9 @@ def house(path: str, data: Path, frames: int | None) -> Scene:
     return _of_recording(f"house-{path}", noisy, exact, frames or -(-len(noisy) // 5), noisy.ground_truth_mesh())
 
 
-def _of_recording(name: str, noisy: Dataset, exact: Dataset, frames: int, ground_truth: Mesh | None) -> Scene:
-    fused, between = split(len(noisy), max(2, len(noisy) // frames))
+def _of_recording(name: str, noisy: Dataset, exact: Dataset, frames: int, ground_truth: Mesh | None,
+                  held_out: int = HELD_OUT) -> Scene:
+    fused, between = split(len(noisy), max(2, len(noisy) // frames), held_out)
     return Scene(name, [noisy[i] for i in fused], [exact[i] for i in between], ground_truth)
 
 
