@@ -57,7 +57,8 @@ def row(name: str, mesh: Mesh, megabytes: float, milliseconds: float, scene: Sce
     seen = evaluate_rendering(mesh, scene.held_out, depth_min=near, depth_max=far)
     shares = ["-"] * 4
     if scene.ground_truth is not None:
-        surface = evaluate_surface(mesh, scene.ground_truth, views=Views(scene.frames[0].camera, scene.T_world_camera, near, far))
+        views = Views(scene.frames[0].camera, scene.T_world_camera, near, far)
+        surface = evaluate_surface(mesh, scene.ground_truth, views=views)
         wide, strict = surface.scores
         shares = [f"{100 * x:.1f}" for x in (wide.precision, wide.recall, wide.f1, strict.f1)]
     return (f"| {name} | {' | '.join(shares)} | {seen.depth_l1_cm:.2f} | {seen.depth_median_cm:.2f} | {seen.coverage:.3f} | "
@@ -103,7 +104,8 @@ def encoding(scene: Scene, out: Path) -> None:
 def voxel_size(scene: Scene, out: Path) -> None:
     """Fig. 12: the surface at several voxel sizes, under our defaults."""
     default = uf.Config()
-    variants = {f"{100 * size:g} cm": replace(default, surface=replace(default.surface, voxel_size=size)) for size in VOXEL_SIZES}
+    variants = {f"{100 * size:g} cm": replace(default, surface=replace(default.surface, voxel_size=size))
+                for size in VOXEL_SIZES}
     compare(variants, scene, out / "ablation-voxel-size.jpg", 3)
 
 

@@ -53,7 +53,7 @@ def _compare_frame(caster: RayCaster, reconstruction: Reconstruction, frame) -> 
 def write_worst(path: Path, comparisons: list[Comparison]) -> None:
     """The REGIONS windows with the largest mean error, no two of them overlapping: taken, rendered, error; worst first."""
     rows = [np.hstack([part[y:y + WINDOW[0], x:x + WINDOW[1]] for part in (c.taken, c.rendered, c.drawn_error)])
-            for c, y, x in _worst_windows(comparisons)]
+            for c, y, x in worst_windows(comparisons)]
     half = -(-len(rows) // 2)
     gap = np.full((rows[0].shape[0], 6, 3), 255, np.uint8)
     blank = np.full_like(rows[0], 255)
@@ -61,7 +61,7 @@ def write_worst(path: Path, comparisons: list[Comparison]) -> None:
     cv2.imwrite(str(path), sheet, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
-def _worst_windows(comparisons: list[Comparison]) -> list[tuple[Comparison, int, int]]:
+def worst_windows(comparisons: list[Comparison]) -> list[tuple[Comparison, int, int]]:
     """(frame, row, column) of windows: the worst of each frame, the worst of all frames first."""
     found = []
     for c in comparisons:

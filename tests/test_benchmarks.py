@@ -1,0 +1,94 @@
+"""What the benchmarks measure on: paths through the house, which frames are held out, and the pictures of what is worst."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))
+
+import house  # noqa: E402
+import quality  # noqa: E402
+import quality_pictures  # noqa: E402
+from quality_methods import METHODS, method  # noqa: E402
+from quality_scenes import split  # noqa: E402
+
+from taichi_unifusion.errors import InputError  # noqa: E402
+
+SMOOTH = 0.5         # share by which the motion may change from one frame to the next
+CLEARANCE = 0.35     # [m] of a camera centre to what it sees: no hand passes nearer
+ROUNDING = 1e-12
+
+
+@pytest.mark.parametrize("name", house.PATHS)
+def test_paths_are_rigid_smooth_closed_and_at_a_hands_speed(name):
+    trajectory = house.trajectory(name)
+    T = trajectory.T_world_camera
+    closed = np.concatenate([T, T[:2]])
+    step, turn = house.steps(closed), house.turns(closed)
+    assert len(trajectory) >= 100
+    assert step.max() < 1.02 * house.STEP and turn.max() < 1.02 * house.TURN  # arcs against their chords, measured and resampled
+    speed = np.hypot(step / house.STEP, turn / house.TURN)
+    assert np.abs(np.diff(speed)).max() < SMOOTH * speed.mean() and speed.min() > 0.5 * speed.mean()
+    R = T[:, :3, :3]
+    np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.broadcast_to(np.eye(3), R.shape), atol=ROUNDING)
+    assert np.linalg.det(R).min() > 0.999
+    assert (R[:, 2, 1] < -0.5).all()  # upright: image y points down
+
+
+def test_an_unknown_path_is_told():
+    with pytest.raises(InputError, match="living"):
+        house.trajectory("garden")
+
+
+def test_house_is_seen_from_within_with_its_labels(data):
+    frames = house.load_house(data("aws-small-house"), "bedroom")
+    assert {"Bed", "ChairA", "SofaC", "RoomWall"} <= set(frames.class_names) and len(frames.class_names) == 49
+    for index in (60, 219):  # before the bed; in the narrowest place
+        depth = frames.exact_depth(index)
+        assert depth[depth > 0].min() > CLEARANCE and (depth > 0).mean() > 0.85
+    classes, objects = frames.labels(60)
+    assert (classes == frames.class_names.index("Bed")).mean() > 0.05
+    assert ((classes >= 0) == (objects >= 0)).all()
+
+
+@pytest.mark.parametrize(("count", "every"), [(300, 10), (445, 5), (120, 2), (9, 4), (3, 3)])
+def test_no_frame_is_both_fused_and_held_out(count, every):
+    fused, between = split(count, every, 8)
+    assert fused == list(range(0, count, every))
+    assert len(set(between)) == len(between) <= 8 and between == sorted(between)
+    assert not set(fused) & set(between) and all(0 < i < count for i in between)
+
+
+def testworst_windows_hold_the_error():
+    blank = np.zeros((480, 640, 3), np.uint8)
+    frames = []
+    for index, (y, x, size) in enumerate([(100, 200, 30), (300, 400, 60), (10, 20, 10)]):
+        error = np.zeros((480, 640), np.float32)
+        error[y:y + size, x:x + size] = 0.1
+        frames.append(quality_pictures.Comparison(index, blank, blank, blank, error))
+    worst = quality_pictures.worst_windows(frames)
+    assert [c.index for c, _, _ in worst] == [1, 0, 2]
+    for c, y, x in worst:
+        height, width = quality_pictures.WINDOW
+        assert c.error[y:y + height, x:x + width].sum() == pytest.approx(c.error.sum())
+
+
+def test_table_has_a_dash_where_nothing_was_measured():
+    text = quality.table({"room": {"ours": {"numbers": {"f1_1cm": 0.985, "psnr_db": None, "coverage": 0.5}}}})
+    titles, rule, line = ([cell.strip() for cell in row.strip("|").split("|")] for row in text.splitlines())
+    cells = dict(zip(titles, line, strict=True))
+    assert (cells["F1 1 cm"], cells["PSNR dB"], cells["coverage"], cells["method"]) == ("98.5", "-", "0.500", "ours")
+    assert len(rule) == len(titles)
+
+
+def test_methods_are_named_or_files(tmp_path):
+    assert all(callable(method(name)) for name in METHODS)
+    (tmp_path / "mine.yaml").write_text("surface: {voxel_size: 0.04}\n")
+    assert callable(method(str(tmp_path / "mine.yaml")))
+    with pytest.raises(InputError, match="tsdf-1cm"):
+        method("tsdf")
