@@ -98,7 +98,7 @@ def main() -> int:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES), metavar="SCENE",
                         help=", ".join(SCENES))
     parser.add_argument("--methods", nargs="+", default=list(METHODS), metavar="METHOD",
-                        help=f"{', '.join(METHODS)}, or FILE.yaml")
+                        help=f"{', '.join(METHODS)}, tsdf-1cm-t8-w3 (truncation, weight) or FILE.yaml")
     parser.add_argument("--frames", type=int, help="about how many frames to fuse (default: every 5th of the house, 30, 60)")
     parser.add_argument("--data", type=Path, default=DATA, help=f"folder of the recordings (default: {DATA})")
     parser.add_argument("--threads", type=int, help="CPU threads of Taichi (default: all)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -72,30 +73,31 @@ def ours(config: Config, frames: Sequence[Frame]) -> Reconstruction:
                           asdict(config))
 
 
-def tsdf(voxel_size: float, frames: Sequence[Frame]) -> Reconstruction:
-    """Open3D's VoxelBlockGrid on the raw depth, float32, under the truncation and threshold that served it best."""
+def tsdf(frames: Sequence[Frame], voxel_size: float, truncation: float = TRUNCATION,
+         min_weight: float = MIN_WEIGHT) -> Reconstruction:
+    """Open3D's VoxelBlockGrid on the raw depth, float32."""
     import open3d as o3d
     from open3d.core import Device, Tensor, float32
 
     cpu, far = Device("CPU:0"), DEPTH_RANGE[1]
-    grid = o3d.t.geometry.VoxelBlockGrid(tuple(TSDF_BYTES), (float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, 20_000, cpu)
+    grid = o3d.t.geometry.VoxelBlockGrid(tuple(TSDF_BYTES), (float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, 8_000, cpu)
     K, watch = Tensor(frames[0].camera.matrix), Stopwatch([])
     for frame in frames:
+        depth = o3d.t.geometry.Image(Tensor(np.where(frame.depth < DEPTH_RANGE[0], 0, frame.depth).astype(np.float32)))
+        color = o3d.t.geometry.Image(Tensor(frame.color.astype(np.float32) / 255))
+        T_camera_world = Tensor(np.linalg.inv(frame.T_world_camera))
         with watch.lap():
-            depth = o3d.t.geometry.Image(Tensor(np.where(frame.depth < DEPTH_RANGE[0], 0, frame.depth).astype(np.float32)))
-            color = o3d.t.geometry.Image(Tensor(frame.color.astype(np.float32) / 255))
-            T_camera_world = Tensor(np.linalg.inv(frame.T_world_camera))
-            blocks = grid.compute_unique_block_coordinates(depth, K, T_camera_world, 1.0, far, TRUNCATION)
-            grid.integrate(blocks, depth, color, K, K, T_camera_world, 1.0, far, TRUNCATION)
+            blocks = grid.compute_unique_block_coordinates(depth, K, T_camera_world, 1.0, far, truncation)
+            grid.integrate(blocks, depth, color, K, K, T_camera_world, 1.0, far, truncation)
     start = time.perf_counter()
-    extracted = grid.extract_triangle_mesh(MIN_WEIGHT)
+    extracted = grid.extract_triangle_mesh(min_weight)
     mesh = Mesh(extracted.vertex.positions.numpy(), extracted.triangle.indices.numpy().astype(np.int32),
                 attributes={"color": extracted.vertex.colors.numpy()})
     mesh_s = time.perf_counter() - start
     voxels = grid.hashmap().size() * BLOCK**3
     surface, color = voxels * (TSDF_BYTES["tsdf"] + TSDF_BYTES["weight"]) / 2**20, voxels * TSDF_BYTES["color"] / 2**20
     return Reconstruction(mesh, None, surface, color, _lean_mb(grid), *watch.median(), mesh_s,
-                          {"voxel_size": voxel_size, "truncation_voxels": TRUNCATION, "min_weight": MIN_WEIGHT, "block": BLOCK})
+                          {"voxel_size": voxel_size, "truncation_voxels": truncation, "min_weight": min_weight, "block": BLOCK})
 
 
 def _lean_mb(grid) -> float:
@@ -116,15 +118,19 @@ METHODS: dict[str, Callable[[Sequence[Frame]], Reconstruction]] = {
     "ours": lambda frames: ours(Config(), frames),
     "ours-2.5cm": lambda frames: ours(_finer(), frames),
     "paper": lambda frames: ours(load_config(PAPER), frames),
-    "tsdf-1cm": partial(tsdf, 0.01),
-    "tsdf-2cm": partial(tsdf, 0.02),
+    "tsdf-1cm": partial(tsdf, voxel_size=0.01),
+    "tsdf-2cm": partial(tsdf, voxel_size=0.02),
 }
 
 
 def method(name: str) -> Callable[[Sequence[Frame]], Reconstruction]:
-    """A method of METHODS, or ours under the YAML file of that name."""
+    """A method of METHODS, ours under the YAML file of that name, or a TSDF such as tsdf-1cm-t8-w3: truncation, weight."""
     if name in METHODS:
         return METHODS[name]
+    if match := re.fullmatch(r"tsdf-([\d.]+)cm-t([\d.]+)-w([\d.]+)", name):
+        centimetres, truncation, min_weight = map(float, match.groups())
+        return partial(tsdf, voxel_size=centimetres / 100, truncation=truncation, min_weight=min_weight)
     if Path(name).suffix in (".yaml", ".yml"):
         return partial(ours, load_config(name))
-    raise InputError(f"method '{name}' is unknown; there are {', '.join(METHODS)}, and configurations FILE.yaml")
+    raise InputError(f"method '{name}' is unknown; there are {', '.join(METHODS)}, tsdf-1cm-t8-w3 (truncation in voxels, "
+                     "weight threshold) and configurations FILE.yaml")

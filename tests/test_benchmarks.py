@@ -90,5 +90,7 @@ def test_methods_are_named_or_files(tmp_path):
     assert all(callable(method(name)) for name in METHODS)
     (tmp_path / "mine.yaml").write_text("surface: {voxel_size: 0.04}\n")
     assert callable(method(str(tmp_path / "mine.yaml")))
-    with pytest.raises(InputError, match="tsdf-1cm"):
-        method("tsdf")
+    assert method("tsdf-1.5cm-t8-w3").keywords == {"voxel_size": 0.015, "truncation": 8, "min_weight": 3}
+    for unknown in ("tsdf", "tsdf-1cm-t8", "TSDF-1cm"):
+        with pytest.raises(InputError, match="tsdf-1cm"):
+            method(unknown)
