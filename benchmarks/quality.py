@@ -15,17 +15,20 @@ import argparse
 import gc
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from quality_methods import METHODS, Reconstruction, method
-from quality_pictures import compare, write_overview, write_worst
+from quality_pictures import REGIONS, compare, overview_frames, write_overview, write_worst
 from quality_scenes import DEPTH_RANGE, SCENES, Scene
 
 import taichi_unifusion as uf
 from taichi_unifusion.errors import UniFusionError
 from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
+from taichi_unifusion.evaluation.rendering import FrameScore
 from taichi_unifusion.io import check_writable
+from taichi_unifusion.types import Frame
 
 DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 COLUMNS = {  # title -> (where in a row's numbers, format)
@@ -36,15 +39,15 @@ COLUMNS = {  # title -> (where in a row's numbers, format)
 }
 
 
-def measure(reconstruction: Reconstruction, scene: Scene) -> dict[str, float | None]:
-    """All numbers of one row of the table."""
+def measure(reconstruction: Reconstruction, scene: Scene) -> tuple[dict[str, float | None], tuple[FrameScore, ...]]:
+    """All numbers of one row of the table, and the scores of the held-out frames."""
     near, far = DEPTH_RANGE
     numbers = {"map_mb": reconstruction.surface_mb + reconstruction.color_mb, "surface_mb": reconstruction.surface_mb,
                "color_mb": reconstruction.color_mb, "lean_mb": reconstruction.lean_mb, "cpu_ms": reconstruction.cpu_ms,
                "wall_ms": reconstruction.wall_ms, "mesh_s": reconstruction.mesh_s, "triangles": len(reconstruction.mesh.faces)}
-    rendering = asdict(evaluate_rendering(reconstruction.mesh, scene.held_out, color=reconstruction.color, depth_min=near,
-                                          depth_max=far))
-    numbers.update({name: value for name, value in rendering.items() if name != "frames"})
+    rendering = evaluate_rendering(reconstruction.mesh, scene.held_out, color=reconstruction.color, depth_min=near,
+                                   depth_max=far)
+    numbers.update({name: value for name, value in asdict(rendering).items() if name != "frames"})
     if scene.ground_truth is not None:
         views = Views(scene.frames[0].camera, scene.T_world_camera, near, far)
         surface = evaluate_surface(reconstruction.mesh, scene.ground_truth, views=views)
@@ -52,7 +55,13 @@ def measure(reconstruction: Reconstruction, scene: Scene) -> dict[str, float | N
         for score in surface.scores:
             at = f"{100 * score.threshold:g}cm"
             numbers.update({f"precision_{at}": score.precision, f"recall_{at}": score.recall, f"f1_{at}": score.f1})
-    return numbers
+    return numbers, rendering.frames
+
+
+def worst_frames(scene: Scene, scores: Sequence[FrameScore]) -> list[Frame]:
+    """The held-out frames with the smallest share of readings that a surface comes near to."""
+    shares = [1.0 if score.depth_within is None else score.depth_within for score in scores]
+    return [scene.held_out[i] for i in sorted(range(len(shares)), key=shares.__getitem__)[:REGIONS]]
 
 
 def table(results: dict[str, dict[str, dict]]) -> str:
@@ -80,11 +89,13 @@ def run(options: argparse.Namespace) -> dict[str, dict[str, dict]]:
         for name in options.methods:
             reconstruction = method(name)(scene.frames)
             label = Path(name).stem if name not in METHODS else name
-            rows[label] = {"numbers": measure(reconstruction, scene), "settings": reconstruction.settings}
+            numbers, scores = measure(reconstruction, scene)
+            rows[label] = {"numbers": numbers, "settings": reconstruction.settings}
             print(table({scene_name: {label: rows[label]}}).splitlines()[2], flush=True)
             if options.out:
-                pictures[label] = compare(reconstruction, scene)
-                write_worst(options.out / f"worst-{scene_name}-{label}.jpg", pictures[label])
+                worst = compare(reconstruction, worst_frames(scene, scores))
+                write_worst(options.out / f"worst-{scene_name}-{label}.jpg", worst)
+                pictures[label] = compare(reconstruction, overview_frames(scene))
                 (options.out / "quality.json").write_text(json.dumps(results, indent=1, default=str))
             del reconstruction
             gc.collect()  # maps give their memory back before the next are made

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,12 +14,14 @@ from quality_scenes import DEPTH_RANGE, Scene
 
 from taichi_unifusion.evaluation.raycasting import RayCaster
 from taichi_unifusion.evaluation.rendering import render_frame
+from taichi_unifusion.types import Frame
 
 SCALE = 0.10          # [m] error that is drawn brightest
 MISSING = (255, 0, 255)   # BGR where there is a reading and no surface
 NO_TRUTH = (60, 60, 60)   # BGR where there is nothing to compare with
 WINDOW = (120, 160)   # pixels of a region
 REGIONS = 8
+OVERVIEW = 3          # frames in the overview of a scene
 QUALITY = 82          # of JPEG
 
 
@@ -33,13 +36,18 @@ class Comparison:
     error: NDArray[np.float32]   # (H, W) [m], at most SCALE; SCALE where surface is missing
 
 
-def compare(reconstruction: Reconstruction, scene: Scene) -> list[Comparison]:
-    """All held-out frames of a scene, rendered."""
+def compare(reconstruction: Reconstruction, frames: Iterable[Frame]) -> list[Comparison]:
+    """These frames beside what the reconstruction shows from the same poses."""
     caster = RayCaster(reconstruction.mesh, "reconstruction")
-    return [_compare_frame(caster, reconstruction, frame) for frame in scene.held_out]
+    return [_compare_frame(caster, reconstruction, frame) for frame in frames]
 
 
-def _compare_frame(caster: RayCaster, reconstruction: Reconstruction, frame) -> Comparison:
+def overview_frames(scene: Scene, count: int = OVERVIEW) -> list[Frame]:
+    """Some held-out frames, evenly over the scene."""
+    return [scene.held_out[i] for i in np.linspace(0, len(scene.held_out) - 1, count + 2).round().astype(int)[1:-1]]
+
+
+def _compare_frame(caster: RayCaster, reconstruction: Reconstruction, frame: Frame) -> Comparison:
     image = render_frame(caster, frame, reconstruction.color)
     read = (frame.depth >= DEPTH_RANGE[0]) & (frame.depth <= DEPTH_RANGE[1])
     missing = read & ~np.isfinite(image.depth)
@@ -72,12 +80,10 @@ def worst_windows(comparisons: list[Comparison]) -> list[tuple[Comparison, int, 
     return [row[1:] for row in found[:REGIONS]]
 
 
-def write_overview(path: Path, named: dict[str, list[Comparison]], frames: int = 3) -> None:
-    """Some held-out frames: what was taken, then each method's colour above its depth error."""
-    count = len(next(iter(named.values())))
+def write_overview(path: Path, named: dict[str, list[Comparison]]) -> None:
+    """The same frames by several methods: what was taken, then each method's colour above its depth error."""
     rows = []
-    for i in np.linspace(0, count - 1, min(frames, count) + 2).round().astype(int)[1:-1]:
-        taken = next(iter(named.values()))[i].taken
+    for i, taken in enumerate(c.taken for c in next(iter(named.values()))):
         cells = [np.vstack([taken, np.full_like(taken, 255)])]
         cells += [np.vstack([_titled(method[i].rendered, name), method[i].drawn_error]) for name, method in named.items()]
         rows.append(np.hstack([cv2.resize(cell, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for cell in cells]))
