@@ -1,6 +1,7 @@
 """The furnished flat of AWS RoboMaker, rendered as RGB-D: its labels and the paths that a hand could carry a camera along.
 
     python benchmarks/house.py PATH/aws-small-house --out frames     looks at the paths: clearance, steps, contact sheets
+    python benchmarks/house.py PATH/aws-small-house --paths tour --shown 207 290 456 --out docs
 
 `PATH` is the folder that holds house.glb and objects.json.
 """
@@ -128,14 +129,22 @@ def clearance(dataset: SceneDataset, samples: int = 2_000_000) -> NDArray[np.flo
     return cKDTree(points).query(dataset.T_world_camera[:, :3, 3])[0]
 
 
+def picture(dataset: SceneDataset, index: int, width: int = 240) -> NDArray[np.uint8]:
+    """One frame, (H, width, 3) BGR: colour, depth as read (0-5.5 m, black: no reading), classes, one below the other."""
+    frame, (classes, _) = dataset[index], dataset.labels(index)
+    depth = cv2.applyColorMap((np.clip(frame.depth / 5.5, 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
+    depth[frame.depth == 0] = 0
+    palette = np.random.default_rng(0).integers(40, 256, (len(dataset.class_names) + 1, 3), dtype=np.uint8)
+    palette[-1] = 0  # -1: nothing there
+    parts = frame.color[..., ::-1], depth, palette[classes]
+    size = width, width * frame.camera.height // frame.camera.width
+    return np.vstack([cv2.resize(part, size, interpolation=cv2.INTER_AREA) for part in parts])
+
+
 def contact_sheet(dataset: SceneDataset, columns: int = 6, rows: int = 5) -> NDArray[np.uint8]:
-    """Small pictures of frames evenly over a path, colour above depth (0-5.5 m), as (H, W, 3) BGR."""
-    cells = []
-    for index in np.linspace(0, len(dataset) - 1, columns * rows).astype(int):
-        frame = dataset[index]
-        turbo = cv2.applyColorMap((np.clip(frame.depth / 5.5, 0, 1) * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
-        cell = cv2.resize(np.vstack([frame.color[..., ::-1], turbo]), (240, 360), interpolation=cv2.INTER_AREA)
-        cells.append(cv2.putText(cell, str(index), (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 255), 1))
+    """Pictures of frames evenly over a path, numbered, (H, W, 3) BGR."""
+    cells = [cv2.putText(picture(dataset, i), str(i), (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 255), 1)
+             for i in np.linspace(0, len(dataset) - 1, columns * rows).astype(int)]
     return np.vstack([np.hstack(cells[i:i + columns]) for i in range(0, len(cells), columns)])
 
 
@@ -143,14 +152,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("path", type=Path)
     parser.add_argument("--paths", nargs="+", default=list(PATHS), choices=list(PATHS))
+    parser.add_argument("--shown", nargs="+", type=int, metavar="N", help="only write one picture, of these frames of a path")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     for name in options.paths:
         dataset = load_house(options.path, name)
-        T, free = dataset.T_world_camera, clearance(dataset)
+        if options.shown:
+            shown = [picture(dataset, i, 320) for i in options.shown]
+            cv2.imwrite(str(options.out / f"house-{name}.jpg"), np.hstack(shown), [cv2.IMWRITE_JPEG_QUALITY, 80])
+            continue
         write_trajectory(options.out / f"{name}.txt", dataset.trajectory)
         cv2.imwrite(str(options.out / f"{name}.jpg"), contact_sheet(dataset))
+        T, free = dataset.T_world_camera, clearance(dataset)
         closed = np.concatenate([T, T[:1]])
         print(f"{name}: {len(T)} frames, {steps(closed).sum():.1f} m, steps up to {100 * steps(closed).max():.1f} cm and "
               f"{turns(closed).max():.1f} degrees, nearest surface {free.min():.2f} m (frame {free.argmin()})")
