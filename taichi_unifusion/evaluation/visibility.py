@@ -1,0 +1,76 @@
+"""What a set of cameras looked at: which points they saw, and which space they looked through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..types import Mesh, PinholeCamera, check_rigid
+from .raycasting import RayCaster, RayHits
+
+STEEPEST = 8.0  # slope of depth, in depths of one pixel's width a pixel: about 80 degrees; beyond it a plane is not trusted
+
+
+@dataclass(frozen=True)
+class Views:
+    """Where a camera with a limited range looked from."""
+
+    camera: PinholeCamera
+    T_world_camera: NDArray[np.float64]  # (N, 4, 4)
+    depth_min: float = 0.1               # [m]
+    depth_max: float = 5.0               # [m]
+
+    def __post_init__(self) -> None:
+        poses = np.asarray(self.T_world_camera, np.float64)
+        if poses.ndim != 3 or not len(poses):
+            raise InputError(f"views: T_world_camera must be (N, 4, 4) with at least one pose, got {poses.shape}")
+        poses = np.stack([check_rigid(T, f"views: pose {i}") for i, T in enumerate(poses)])
+        object.__setattr__(self, "T_world_camera", poses)
+        if not 0 < self.depth_min < self.depth_max:
+            raise InputError(f"views: need 0 < depth_min < depth_max, got {self.depth_min} and {self.depth_max}")
+
+
+def points_within_view(views: Views, mesh: Mesh, points: tuple[NDArray, ...], behind: tuple[float, ...],
+                       ) -> tuple[NDArray[np.bool_], ...]:
+    """For each set of points (N, 3) world [m]: which (N,) lie in the view of at least one camera.
+
+    In view means: inside the image, in the depth range, and no more than `behind` metres (one number a set) deeper than the first
+    surface of `mesh` on the same ray; where a ray hits nothing it is free to the end of the range. All sets share the casting.
+    """
+    caster = RayCaster(mesh, "ground truth")
+    points = tuple(np.asarray(p, np.float64) for p in points)
+    seen = tuple(np.zeros(len(p), bool) for p in points)
+    corners = caster.mesh.vertices[caster.mesh.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    for T_world_camera in views.T_world_camera:
+        hits = caster.cast(views.camera, T_world_camera)
+        for p, found, slack in zip(points, seen, behind, strict=True):
+            left = np.nonzero(~found)[0]
+            found[left] = _in_view(views, hits, corners[:, 0], normals, p[left], slack)
+    return seen
+
+
+def _in_view(views: Views, hits: RayHits, corner: NDArray, normals: NDArray, points: NDArray, slack: float) -> NDArray[np.bool_]:
+    """Which points (N, 3) world [m] one camera has in view; `corner` and `normals` are the planes of the triangles."""
+    camera, eye = views.camera, hits.T_world_camera[:3, 3]
+    x, y, z = ((points - eye) @ hits.T_world_camera[:3, :3]).T
+    inside = np.zeros(len(points), bool)
+    ahead = np.nonzero((z >= views.depth_min) & (z <= views.depth_max))[0]
+    z = z[ahead]
+    u = np.rint(camera.fx * x[ahead] / z + camera.cx).astype(int)
+    v = np.rint(camera.fy * y[ahead] / z + camera.cy).astype(int)
+    drawn = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    ahead, u, v, z = ahead[drawn], u[drawn], v[drawn], z[drawn]
+
+    depth, triangle = hits.depth[v, u].astype(np.float64), hits.triangle[v, u]
+    to_point = points[ahead] - eye
+    normal = normals[triangle]
+    with np.errstate(divide="ignore", invalid="ignore"):  # a plane that holds the ray: its depth at the pixel's centre counts
+        there = z * np.einsum("nd,nd->n", normal, corner[triangle] - eye) / np.einsum("nd,nd->n", normal, to_point)
+    trust = STEEPEST * depth / min(camera.fx, camera.fy)
+    surface = np.where(np.isfinite(there), np.clip(there, depth - trust, depth + trust), depth)
+    inside[ahead] = (triangle < 0) | (z <= surface + slack)
+    return inside
