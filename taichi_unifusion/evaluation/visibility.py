@@ -65,7 +65,8 @@ def _in_view(views: Views, hits: RayHits, corner: NDArray, normals: NDArray, poi
     drawn = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
     ahead, u, v, z = ahead[drawn], u[drawn], v[drawn], z[drawn]
 
-    depth, triangle = hits.depth[v, u].astype(np.float64), hits.triangle[v, u]
+    triangle = hits.triangle[v, u]
+    depth = np.where(triangle >= 0, hits.depth[v, u].astype(np.float64), 0.0)
     to_point = points[ahead] - eye
     normal = normals[triangle]
     with np.errstate(divide="ignore", invalid="ignore"):  # a plane that holds the ray: its depth at the pixel's centre counts
