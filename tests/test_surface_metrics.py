@@ -41,7 +41,7 @@ def score(reconstruction, ground_truth, **options):
 
 def test_a_mesh_against_itself_is_perfect():
     result = score(random_soup(200, 0), random_soup(200, 0))
-    assert result.accuracy_cm == pytest.approx(0, abs=100 * ROUNDING) and result.chamfer_cm == pytest.approx(0, abs=100 * ROUNDING)
+    assert (result.accuracy_cm, result.completeness_cm, result.chamfer_cm) == pytest.approx((0, 0, 0), abs=100 * ROUNDING)
     assert [(s.precision, s.recall, s.f1) for s in result.scores] == [(1, 1, 1)] * 2
     assert (result.reconstruction_points, result.ground_truth_points) == (SAMPLES, SAMPLES)
 
@@ -109,7 +109,7 @@ def test_samples_lie_on_the_surface_in_proportion_to_area():
         part = points[int(np.ceil(first)):int(last)]  # strata follow the list of triangles
         assert np.sqrt(squared_distance_to_triangles(part, np.repeat(corners[None], len(part), 0))).max(initial=0) < ROUNDING
         if len(part) > 100:
-            spread = np.cov(part.T).trace()  # of an even distribution over a triangle: a twelfth of the sum of |corner - centre|^2
+            spread = np.cov(part.T).trace()  # if even over the triangle: a twelfth of the sum of |corner - centre|^2
             assert part.mean(axis=0) == pytest.approx(corners.mean(axis=0), abs=0.1 * np.sqrt(spread))
             assert spread == pytest.approx(((corners - corners.mean(axis=0)) ** 2).sum() / 12, rel=0.1)
 
@@ -130,7 +130,7 @@ def test_distance_to_a_triangle_of_any_shape():
 def test_distances_are_those_of_every_triangle(mesh):
     points = np.random.default_rng(0).uniform(-1.5, 1.5, (150, 3))
     corners = mesh.vertices[mesh.faces].astype(float)
-    known = np.sqrt(np.min([squared_distance_to_triangles(points, np.repeat(c[None], len(points), 0)) for c in corners], axis=0))
+    known = np.sqrt(np.min([squared_distance_to_triangles(points, np.repeat(c[None], len(points), 0)) for c in corners], 0))
     measure = SurfaceDistance(mesh)
     found, near = measure(points), known < EXACT_M
     np.testing.assert_allclose(found[near], known[near], atol=ROUNDING)
@@ -182,9 +182,9 @@ def in_view(points, behind: float = 0.0, views: Views = VIEWS) -> list[bool]:
 
 def test_what_a_camera_sees():
     assert in_view([(0, 0, 1), (0.19, -0.19, 1), (0.6, 0, 2), (1.5, 1.1, 2)]) == [True] * 4
-    assert in_view([(0, 0, 1.4), (0.2, 0, 1.2), (0.3, 0, 2)]) == [False] * 3        # the box's back and side, the wall behind it
-    assert in_view([(1.7, 0, 2), (0, 1.3, 2), (0, 0, -1), (0, 0, 0)]) == [False] * 4  # beside the image, behind the camera, in it
-    assert in_view([(0, 0, 0.5), (0.6, 0, 1.9)]) == [True] * 2                       # free space
+    assert in_view([(0, 0, 1.4), (0.2, 0, 1.2), (0.3, 0, 2)]) == [False] * 3  # the box's back and side, the wall behind it
+    assert in_view([(1.7, 0, 2), (0, 1.3, 2), (0, 0, -1), (0, 0, 0)]) == [False] * 4  # beside the image, behind the camera
+    assert in_view([(0, 0, 0.5), (0.6, 0, 1.9)]) == [True] * 2  # free space
     assert in_view([(0, 0, 1.05), (0.6, 0, 2.05)], behind=0.1) == [True] * 2
     assert in_view([(0, 0, 1.15), (0.6, 0, 2.15)], behind=0.1) == [False] * 2
     assert in_view([(0, 0, 0.25), (0.6, 0, 2)], views=Views(CAMERA, VIEWS.T_world_camera, 0.3, 1.9)) == [False] * 2

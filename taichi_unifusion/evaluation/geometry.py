@@ -57,8 +57,8 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[
 class SurfaceDistance:
     """Distances from points to the surface of a checked mesh.
 
-    A point is measured exactly against the triangles whose pieces have the nearest centres. Within 10 cm no triangle that could be
-    nearer is left out, unless more than 96 pieces crowd there; farther off a distance may come out some millimetres too long.
+    A point is measured exactly against the triangles whose pieces have the nearest centres. Within 10 cm no triangle that could
+    be nearer is left out, unless more than 96 pieces crowd there; farther off a distance may come out some millimetres too long.
     """
 
     def __init__(self, mesh: Mesh) -> None:

@@ -62,9 +62,9 @@ def evaluate_rendering(mesh: Mesh, frames: Iterable[Frame], *, color: ColorAt | 
                        depth_max: float = 5.0) -> RenderingResult:
     """Compare images with the mesh rendered at their poses.
 
-    Depth is that of the rays through the pixel centres, from either side of the surface. Colour is `color` at the points hit (the
-    query of a colour LIM, as published), else the mesh's vertex colours, else none. Compared are pixels whose reading lies in
-    depth_min..depth_max [m] and whose ray hits; what is not hit lowers `coverage` and `depth_within` only.
+    Depth is that of the rays through the pixel centres, from either side of the surface. Colour is `color` at the points hit
+    (the query of a colour LIM, as published), else the mesh's vertex colours, else none. Compared are pixels whose reading lies
+    in depth_min..depth_max [m] and whose ray hits; what is not hit lowers `coverage` and `depth_within` only.
 
     Raises InputError for a mesh that is empty or not finite, where there is no frame, or no frame with a reading in range;
     PoseError for a frame without a pose.
@@ -116,7 +116,7 @@ def _score(rendered: RenderedFrame, frame: Frame, depth_min: float, depth_max: f
 
 
 def psnr(image: NDArray, reference: NDArray, mask: NDArray[np.bool_]) -> float:
-    """Peak signal-to-noise ratio [dB] over the pixels (H, W) of `mask`, of images (H, W, c) in [0, 1]; inf where they are equal."""
+    """Peak signal-to-noise ratio [dB] over the pixels (H, W) of `mask`, of images (H, W, c) in [0, 1]; inf for equal ones."""
     squared = float(np.mean((image[mask].astype(np.float64) - reference[mask]) ** 2))
     return -10 * float(np.log10(squared)) if squared > 0 else float("inf")
 

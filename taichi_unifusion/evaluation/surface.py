@@ -51,14 +51,14 @@ def evaluate_surface(reconstruction: Mesh, ground_truth: Mesh, *, views: Views |
                      distance_to: Literal["surface", "samples"] = "surface") -> SurfaceResult:
     """Compare two meshes by `samples` points drawn evenly from each, both in world coordinates [m].
 
-    Distances are to the other *surface*. "samples" measures to its samples instead, as published: that is the same where they lie
-    dense, but 100,000 samples of a room of 100 m^2 are 3 cm apart, so that even a perfect mesh fails a threshold of 1 cm.
+    Distances are to the other *surface*. "samples" measures to its samples instead, as published: the same where they lie dense,
+    but 100,000 samples of 100 m^2 of surface are 3 cm apart, and even a perfect mesh fails a threshold of 1 cm.
 
     With `views`, only what those cameras could tell is compared:
     * a true point counts if a camera saw it: inside the image, in the depth range, nothing of the truth in front of it;
     * a reconstructed point counts if a camera looked at its place: inside the image, in the depth range, and in front of the
-      true surface on that ray or at most 10 cm behind it. So surface invented in free space, beyond an edge or as a second wall is
-      an error; what lies outside every image, or deeper behind what was seen, is neither right nor wrong;
+      true surface on that ray or at most 10 cm behind it. So surface invented in free space, beyond an edge or as a second wall
+      is an error; what lies outside every image, or deeper behind what was seen, is neither right nor wrong;
     * its distance is to the *whole* true surface, so that what is right is never punished for having been cropped.
 
     Raises InputError for a mesh that is empty or not finite, for meshes that are nowhere near each other, or where the cameras
@@ -79,7 +79,8 @@ def evaluate_surface(reconstruction: Mesh, ground_truth: Mesh, *, views: Views |
         _check_seen(*seen)
     of_reconstruction, of_truth = (_thin(points[mask], samples, rng) for points, mask in zip(drawn, seen, strict=True))
     if distance_to == "surface":
-        to_truth, to_reconstruction = SurfaceDistance(ground_truth)(of_reconstruction), SurfaceDistance(reconstruction)(of_truth)
+        to_truth = SurfaceDistance(ground_truth)(of_reconstruction)
+        to_reconstruction = SurfaceDistance(reconstruction)(of_truth)
     else:
         to_truth = _distance_to_samples(of_reconstruction, drawn[1][:: POOL if views else 1])
         to_reconstruction = _distance_to_samples(of_truth, drawn[0][:: POOL if views else 1])
@@ -119,7 +120,8 @@ def _check_overlap(reconstruction: Mesh, ground_truth: Mesh) -> None:
 
 def _check_seen(reconstruction: NDArray, ground_truth: NDArray) -> None:
     if not ground_truth.any():
-        raise InputError("surface: the cameras see nothing of the ground truth; are poses and mesh in the same frame of reference?")
+        raise InputError("surface: the cameras see nothing of the ground truth; are poses and mesh in the same frame of "
+                         "reference?")
     if not reconstruction.any():
         raise InputError("surface: the cameras look at nothing of the reconstruction; are poses and mesh in the same frame of "
                          "reference?")

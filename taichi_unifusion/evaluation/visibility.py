@@ -37,8 +37,8 @@ def points_within_view(views: Views, mesh: Mesh, points: tuple[NDArray, ...], be
                        ) -> tuple[NDArray[np.bool_], ...]:
     """For each set of points (N, 3) world [m]: which (N,) lie in the view of at least one camera.
 
-    In view means: inside the image, in the depth range, and no more than `behind` metres (one number a set) deeper than the first
-    surface of `mesh` on the same ray; where a ray hits nothing it is free to the end of the range. All sets share the casting.
+    In view means: inside the image, in the depth range, and no more than `behind` metres (one number a set) deeper than the
+    first surface of `mesh` on the same ray; a ray that hits nothing is free to the end of the range. All sets share the casting.
     """
     caster = RayCaster(mesh, "ground truth")
     points = tuple(np.asarray(p, np.float64) for p in points)
@@ -53,7 +53,8 @@ def points_within_view(views: Views, mesh: Mesh, points: tuple[NDArray, ...], be
     return seen
 
 
-def _in_view(views: Views, hits: RayHits, corner: NDArray, normals: NDArray, points: NDArray, slack: float) -> NDArray[np.bool_]:
+def _in_view(views: Views, hits: RayHits, corner: NDArray, normals: NDArray, points: NDArray,
+             slack: float) -> NDArray[np.bool_]:
     """Which points (N, 3) world [m] one camera has in view; `corner` and `normals` are the planes of the triangles."""
     camera, eye = views.camera, hits.T_world_camera[:3, 3]
     x, y, z = ((points - eye) @ hits.T_world_camera[:3, :3]).T
