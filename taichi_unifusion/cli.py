@@ -7,6 +7,7 @@ Taichi is imported where it is used, so that `--help` is there at once. UNIFUSIO
 from __future__ import annotations
 
 import argparse
+import inspect
 import logging
 import os
 import sys
@@ -17,6 +18,7 @@ import tyro
 from tyro.conf import subcommand
 
 from .commands.config import ShowConfig, show_config
+from .commands.evaluate import METRICS, Evaluate
 from .commands.info import Info, info
 from .commands.mesh import ExtractMesh, extract_mesh
 from .commands.reconstruct import Reconstruct, reconstruct
@@ -30,9 +32,10 @@ logger = logging.getLogger(__name__)
 DESCRIPTION = ("RGB-D frames with camera poses in, a coloured surface out.\n\n"
                "unifusion COMMAND --help: explains a command\n\nunifusion --version: prints the version")
 
-COMMANDS: dict[str, tuple[type, Callable[..., int]]] = {
+COMMANDS: dict[str, tuple[type, Callable[..., int] | dict]] = {  # options and function, or a group: its help, its commands
     "reconstruct": (Reconstruct, reconstruct),
     "mesh": (ExtractMesh, extract_mesh),
+    "evaluate": (Evaluate, METRICS),
     "info": (Info, info),
     "config": (ShowConfig, show_config),
 }
@@ -70,19 +73,24 @@ def _dispatch(argv: list[str]) -> int:
 
         print(f"unifusion {__version__}")
         return DONE
-    name, arguments = (argv[0], argv[1:]) if argv and argv[0] in COMMANDS else (None, argv)
+    return _run("unifusion", DESCRIPTION, COMMANDS, argv)
+
+
+def _run(prog: str, description: str, commands: dict, argv: list[str]) -> int:
+    name, arguments = (argv[0], argv[1:]) if argv and argv[0] in commands else (None, argv)
     if name is None:  # help, or no such command: tyro says it
         every = Union[tuple(Annotated[_short(options), subcommand(name, description=options.__doc__.splitlines()[0])]
-                            for name, (options, _) in COMMANDS.items())]
-        tyro.cli(every, prog="unifusion", description=DESCRIPTION, args=arguments)
+                            for name, (options, _) in commands.items())]
+        tyro.cli(every, prog=prog, description=description, args=arguments)
         return FAILED
-    options, command = COMMANDS[name]
-    return command(_parse(name, options, arguments))
+    options, command = commands[name]
+    if isinstance(command, dict):
+        return _run(f"{prog} {name}", inspect.cleandoc(options.__doc__), command, arguments)
+    return command(_parse(f"{prog} {name}", options, arguments))
 
 
-def _parse(name: str, options: type, arguments: list[str]):
+def _parse(prog: str, options: type, arguments: list[str]):
     """The options of a command; the file that --config names gives the defaults of the settings."""
-    prog = f"unifusion {name}"
     if {"-h", "--help"} & set(arguments):
         options = _short(options)
     if "settings" not in options.__dataclass_fields__:

@@ -62,4 +62,5 @@ class RecordingOptions:
     @property
     def about(self) -> dict[str, object]:
         """The recording and the choice of frames, for the metrics."""
-        return {"format": self.format, "path": str(self.path or ""), "start": self.start, "end": self.end, "every": self.every}
+        return {"format": self.format, "path": str(self.path or ""), "start": self.start, "end": self.end, "every": self.every,
+                "reading": {name: str(value) if isinstance(value, Path) else value for name, value in self.reading.items()}}

@@ -1,0 +1,148 @@
+"""`unifusion evaluate rendering`: a mesh, a colour map and held-out frames -> depth L1, PSNR, SSIM."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from ..datasets import Dataset, open_dataset
+from ..errors import DatasetError, FrameError, InputError
+from ..terminal import format_table, frame_progress
+from .recording import FORMAT_DEFAULT
+from .scores import ScoreOptions, cell, percent
+
+if TYPE_CHECKING:
+    from ..evaluation.runs import Run
+    from ..types import Frame
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class EvaluateRendering(ScoreOptions):
+    """Compare depth and colour, rendered at the frames' poses, with the frames: depth L1, coverage, PSNR, SSIM.
+
+    Example: unifusion evaluate rendering results/kitchen
+
+    Of a results folder, with frames that its run did not use: those half-way between the ones that it did, unless --start, --end
+    or --every choose others. Colour is decoded from its colour map at the points that the rays hit.
+    """
+
+    reconstruction: Annotated[Positional[Path], arg(metavar="RESULTS|MESH")]
+    """Results folder of `unifusion reconstruct`, or a mesh file, whose vertex colours are judged."""
+    format: Annotated[Positional[str | None], arg(metavar="[FORMAT]", help_behavior_hint="(default: the run's recording)")] = None
+    """The kind of recording to compare with."""
+    path: Annotated[Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint="(default: the run's recording)")] = None
+    """Where it lies."""
+    start: Annotated[int | None, arg(metavar="A", help_behavior_hint="(default: see above)")] = None
+    """First frame, counted from 0."""
+    end: Annotated[int | None, arg(metavar="B", help_behavior_hint="(default: see above)")] = None
+    """Frame to stop before."""
+    every: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: see above)")] = None
+    """Compare with every N-th frame."""
+    all: FlagCreatePairsOff[bool] = False
+    """Take frames that the run has used, too."""
+    depth_min: Annotated[float | None, arg(metavar="M", help_behavior_hint="(default: the run's, else 0.1)")] = None
+    """Nearest reading to compare with, in metres."""
+    depth_max: Annotated[float | None, arg(metavar="M", help_behavior_hint="(default: the run's, else 5)")] = None
+    """Farthest reading to compare with, in metres."""
+    depth_scale: Annotated[float | None, arg(metavar="S", help_behavior_hint=FORMAT_DEFAULT)] = None
+    """Units of the depth images that make a metre."""
+    vertex_colors: FlagCreatePairsOff[bool] = False
+    """Judge the colours of the mesh's vertices instead of the colour map."""
+    device: Literal["auto", "cuda", "cpu"] = "auto"
+    """Where to compute."""
+
+
+def evaluate_rendering(options: EvaluateRendering) -> int:
+    """Mesh, map, frames -> table."""
+    options.check_out()
+    from .. import runtime
+    from ..config import Config
+    from ..evaluation.mesh_files import read_any_mesh
+    from ..evaluation.rendering import WITHIN
+    from ..evaluation.rendering import evaluate_rendering as evaluate
+    from ..evaluation.runs import read_run
+
+    run = read_run(options.reconstruction) if options.reconstruction.is_dir() else None
+    mesh = run.mesh() if run else read_any_mesh(options.reconstruction)
+    recording = _recording(options, run)
+    chosen = choose_frames(options, run, len(recording), recording.name)
+    limits = run.config().preprocess if run else Config().preprocess
+    runtime.init(options.device)
+    color = _color_map(options, run)
+    with frame_progress(len(chosen)) as on_frame:
+        result = evaluate(mesh, _usable(recording, chosen, on_frame), color=color.query if color else None,
+                          depth_min=limits.depth_min if options.depth_min is None else options.depth_min,
+                          depth_max=limits.depth_max if options.depth_max is None else options.depth_max)
+    used = set(run.used if run else ()) & {score.index for score in result.frames}
+    rows = [["depth L1 cm", "median cm", f"within {100 * WITHIN:g} cm %", "coverage %", "PSNR dB", "SSIM"],
+            [cell(result.depth_l1_cm), cell(result.depth_median_cm), percent(result.depth_within), percent(result.coverage),
+             cell(result.psnr_db), cell(result.ssim, 3)]]
+    compared = f"Means over {len(result.frames)} frames of {recording.name}, "
+    compared += f"{len(used)} of which the run has used" if used else "none of which the run has used" if run else "from file"
+    about = {"metric": "rendering", "reconstruction": options.reconstruction, "recording": recording.name,
+             "used_by_the_run": sorted(used), "colour": "map" if color else "vertices"}
+    return options.show(about, result, format_table(rows), f"{compared}; colour from the {'map' if color else 'vertices'}.")
+
+
+def _recording(options: EvaluateRendering, run: Run | None) -> Dataset:
+    reading = {} if options.depth_scale is None else {"depth_scale": options.depth_scale}
+    if options.format is not None:
+        same_format = run is not None and run.format == options.format
+        return open_dataset(options.format, options.path, **{**(run.reading if same_format else {}), **reading})
+    if run is None:
+        raise InputError("rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT PATH")
+    return replace(run, reading={**run.reading, **reading}).recording()
+
+
+def choose_frames(options: EvaluateRendering, run: Run | None, count: int, name: str) -> Sequence[int]:
+    """The frames to compare with, of `count` in the recording: held-out ones, unless `options.all`."""
+    chosen = (options.start, options.end, options.every) != (None, None, None)
+    if run is None or chosen or options.all:
+        start, every = options.start or 0, options.every or 1
+        if start < 0 or every < 1 or (options.end is not None and options.end <= start):
+            raise InputError(f"frames: need 0 <= start < end and every >= 1, got start {start}, end {options.end}, every {every}")
+        asked = range(count)[start:options.end:every]
+        if not asked:
+            raise DatasetError(f"{name}: there is no frame {start}, it has {count} (0 is the first)")
+    else:
+        asked = range(run.start + run.every // 2, min(run.stop, count), run.every)
+    held_out = asked if run is None or options.all else [i for i in asked if i not in set(run.used)]
+    if not held_out:
+        raise InputError("rendering: the run has used every one of these frames; reconstruct with --every 2 or more to hold some "
+                         "out, choose others with --start, --end, --every, or compare with used ones by --all")
+    return held_out
+
+
+def _usable(recording: Dataset, chosen: Sequence[int], on_frame) -> Iterator[Frame]:
+    """The frames that can be read and have a pose; the others are said."""
+    for done, index in enumerate(chosen, start=1):
+        try:
+            frame = recording[index]
+        except FrameError as error:
+            logger.warning("frame left out: %s", error)
+            frame = None
+        if frame is not None and frame.T_world_camera is None:
+            logger.warning("frame left out: %s: there is no pose for it", frame.name or index)
+        elif frame is not None:
+            yield frame
+        on_frame(done, len(chosen))
+
+
+def _color_map(options: EvaluateRendering, run: Run | None):
+    """The colour map of the run, or None where vertex colours are to be judged."""
+    path = run.directory / "maps" / "color.safetensors" if run else None
+    if path is None or options.vertex_colors:
+        return None
+    if not path.exists():
+        logger.warning("%s: no such file; colours are those of the mesh's vertices", path)
+        return None
+    from ..maps import PropertyMap
+
+    return PropertyMap.load(path)

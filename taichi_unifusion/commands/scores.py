@@ -1,0 +1,64 @@
+"""What every `unifusion evaluate` command does with its numbers: a table, or JSON on screen and in a file."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from ..terminal import DONE
+
+
+@dataclass(frozen=True)
+class ScoreOptions:
+    """Where the numbers go."""
+
+    json: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
+    """Print the numbers as JSON instead of a table."""
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(default=None, kw_only=True)
+    """Write the numbers there too, as JSON."""
+
+    def check_out(self) -> None:
+        """Raise FileError if `out` cannot be written, before any work is spent."""
+        if self.out:
+            from ..io import check_writable
+
+            check_writable(self.out.parent)
+
+    def show(self, about: Mapping[str, Any], result: Any, *blocks: str) -> int:
+        """Print blocks of text with an empty line between them, or the result as JSON; write the file. Returns the exit code."""
+        text = json.dumps(_plain({**about, **dataclasses.asdict(result)}), indent=2)
+        if self.out:
+            from ..io import atomic_write
+
+            with atomic_write(self.out) as temporary:
+                temporary.write_text(text + "\n", encoding="utf-8")
+        print(text if self.json else "\n\n".join(blocks))
+        return DONE
+
+
+def cell(value: float | None, digits: int = 2, factor: float = 1.0) -> str:
+    """A number for a table; - where there is none."""
+    return "-" if value is None else f"{factor * value:.{digits}f}"
+
+
+def percent(share: float | None) -> str:
+    """A share of 0..1 for a table, in per cent."""
+    return cell(share, 1, 100.0)
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON knows it: no infinity, no NaN."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
