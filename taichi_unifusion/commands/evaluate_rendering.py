@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+RUN_DEFAULT, CHOICE_DEFAULT = "(default: the run's recording)", "(default: see above)"
+
 
 @dataclass(frozen=True)
 class EvaluateRendering(ScoreOptions):
@@ -29,21 +31,21 @@ class EvaluateRendering(ScoreOptions):
 
     Example: unifusion evaluate rendering results/kitchen
 
-    Of a results folder, with frames that its run did not use: those half-way between the ones that it did, unless --start, --end
-    or --every choose others. Colour is decoded from its colour map at the points that the rays hit.
+    Of a results folder, with frames that its run did not use: those half-way between the ones that it did, unless --start,
+    --end or --every choose others. Colour is decoded from its colour map at the points that the rays hit.
     """
 
     reconstruction: Annotated[Positional[Path], arg(metavar="RESULTS|MESH")]
     """Results folder of `unifusion reconstruct`, or a mesh file, whose vertex colours are judged."""
-    format: Annotated[Positional[str | None], arg(metavar="[FORMAT]", help_behavior_hint="(default: the run's recording)")] = None
+    format: Annotated[Positional[str | None], arg(metavar="[FORMAT]", help_behavior_hint=RUN_DEFAULT)] = None
     """The kind of recording to compare with."""
-    path: Annotated[Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint="(default: the run's recording)")] = None
+    path: Annotated[Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint=RUN_DEFAULT)] = None
     """Where it lies."""
-    start: Annotated[int | None, arg(metavar="A", help_behavior_hint="(default: see above)")] = None
+    start: Annotated[int | None, arg(metavar="A", help_behavior_hint=CHOICE_DEFAULT)] = None
     """First frame, counted from 0."""
-    end: Annotated[int | None, arg(metavar="B", help_behavior_hint="(default: see above)")] = None
+    end: Annotated[int | None, arg(metavar="B", help_behavior_hint=CHOICE_DEFAULT)] = None
     """Frame to stop before."""
-    every: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: see above)")] = None
+    every: Annotated[int | None, arg(metavar="N", help_behavior_hint=CHOICE_DEFAULT)] = None
     """Compare with every N-th frame."""
     all: FlagCreatePairsOff[bool] = False
     """Take frames that the run has used, too."""
@@ -97,7 +99,8 @@ def _recording(options: EvaluateRendering, run: Run | None) -> Dataset:
         same_format = run is not None and run.format == options.format
         return open_dataset(options.format, options.path, **{**(run.reading if same_format else {}), **reading})
     if run is None:
-        raise InputError("rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT PATH")
+        raise InputError("rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT "
+                         "PATH")
     return replace(run, reading={**run.reading, **reading}).recording()
 
 
@@ -105,9 +108,10 @@ def choose_frames(options: EvaluateRendering, run: Run | None, count: int, name:
     """The frames to compare with, of `count` in the recording: held-out ones, unless `options.all`."""
     chosen = (options.start, options.end, options.every) != (None, None, None)
     if run is None or chosen or options.all:
-        start, every = options.start or 0, options.every or 1
+        start, every = options.start or 0, 1 if options.every is None else options.every
         if start < 0 or every < 1 or (options.end is not None and options.end <= start):
-            raise InputError(f"frames: need 0 <= start < end and every >= 1, got start {start}, end {options.end}, every {every}")
+            raise InputError(f"frames: need 0 <= start < end and every >= 1, got start {start}, end {options.end}, "
+                             f"every {every}")
         asked = range(count)[start:options.end:every]
         if not asked:
             raise DatasetError(f"{name}: there is no frame {start}, it has {count} (0 is the first)")
@@ -115,8 +119,8 @@ def choose_frames(options: EvaluateRendering, run: Run | None, count: int, name:
         asked = range(run.start + run.every // 2, min(run.stop, count), run.every)
     held_out = asked if run is None or options.all else [i for i in asked if i not in set(run.used)]
     if not held_out:
-        raise InputError("rendering: the run has used every one of these frames; reconstruct with --every 2 or more to hold some "
-                         "out, choose others with --start, --end, --every, or compare with used ones by --all")
+        raise InputError("rendering: the run has used every one of these frames; reconstruct with --every 2 or more to hold "
+                         "some out, choose others with --start, --end, --every, or compare with used ones by --all")
     return held_out
 
 

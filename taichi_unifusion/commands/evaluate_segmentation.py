@@ -26,8 +26,8 @@ class EvaluateSegmentation(ScoreOptions):
 
     Example: unifusion evaluate segmentation labelled.ply truth.ply --names classes.txt
 
-    Labels are whole numbers: a vertex property of a .ply, one number a line in a .txt, or an array in a .npy. Between two .ply of
-    different vertices, each true point takes the label of the nearest predicted one.
+    Labels are whole numbers: a vertex property of a .ply, one number a line in a .txt, or an array in a .npy. Between two .ply
+    of different vertices, each true point takes the label of the nearest predicted one.
     """
 
     predicted: Annotated[Positional[Path], arg(metavar="PREDICTED")]
@@ -63,8 +63,8 @@ def evaluate_segmentation(options: EvaluateSegmentation) -> int:
              ["all classes", percent(result.mean_iou), percent(result.mean_accuracy), str(len(result.classes))]]
     means += [[name, percent(group.mean_iou), percent(group.mean_accuracy), str(group.classes)]
               for name, group in (("seen classes", result.seen), ("unseen classes *", result.unseen)) if group]
-    notes = (f"{percent(result.overall_accuracy)} % of {result.points:,} points are right; {result.unlabelled:,} of them have no "
-             f"predicted label, {result.ignored:,} more were left out.")
+    notes = (f"{percent(result.overall_accuracy)} % of {result.points:,} points are right; {result.unlabelled:,} of them have "
+             f"no predicted label, {result.ignored:,} more were left out.")
     about = {"metric": "segmentation", "predicted": options.predicted, "ground_truth": options.ground_truth}
     return options.show(about, result, format_table(rows), format_table(means), notes)
 

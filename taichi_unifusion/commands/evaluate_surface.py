@@ -70,8 +70,9 @@ def evaluate_surface(options: EvaluateSurface) -> int:
              ["mean of both (Chamfer)", cell(result.chamfer_cm)]]
     judged = "Judged is everything, seen or not."
     if views:
-        judged = (f"Judged is what {len(views.T_world_camera)} frames could tell: {percent(1 - result.ground_truth_unseen)} % of the "
-                  f"true surface, {percent(1 - result.reconstruction_unseen)} % of the reconstruction; --whole judges everything.")
+        shares_seen = percent(1 - result.ground_truth_unseen), percent(1 - result.reconstruction_unseen)
+        judged = (f"Judged is what {len(views.T_world_camera)} frames could tell: {shares_seen[0]} % of the true surface, "
+                  f"{shares_seen[1]} % of the reconstruction; --whole judges all.")
     about = {"metric": "surface", "reconstruction": options.reconstruction,
              "ground_truth": options.ground_truth or "the recording's", "seen_by": judge.directory if views else None,
              "distance_to": options.to, "samples": options.samples, "seed": options.seed}

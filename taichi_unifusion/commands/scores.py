@@ -32,7 +32,7 @@ class ScoreOptions:
             check_writable(self.out.parent)
 
     def show(self, about: Mapping[str, Any], result: Any, *blocks: str) -> int:
-        """Print blocks of text with an empty line between them, or the result as JSON; write the file. Returns the exit code."""
+        """Print blocks of text with an empty line between them, or JSON, and write the file; returns the exit code."""
         text = json.dumps(_plain({**about, **dataclasses.asdict(result)}), indent=2)
         if self.out:
             from ..io import atomic_write

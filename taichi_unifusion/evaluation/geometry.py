@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..types import Mesh
 
-PIECE_M = 0.03          # [m] triangles are cut into pieces of at most this edge, to find the nearest ones by their centres
+PIECE_M = 0.04          # [m] triangles are cut into pieces of at most this edge, to find the nearest ones by their centres
 MAX_PIECES = 4_000_000  # 0.5 GB of search tree; of a larger surface the pieces are larger
-CANDIDATES = (12, 96)   # pieces looked at for a point; the second where the first leave a doubt
+CANDIDATES = (24, 96)   # pieces looked at for a point; the second where the first leave a doubt
 EXACT_M = 0.1           # [m] beyond it a doubt is left: the distance is at most the radius of a piece too long
 POINT_CHUNK = 20_000    # points measured at once: some 300 MB of intermediate numbers at most
 
@@ -58,7 +58,7 @@ class SurfaceDistance:
     """Distances from points to the surface of a checked mesh.
 
     A point is measured exactly against the triangles whose pieces have the nearest centres. Within 10 cm no triangle that could
-    be nearer is left out, unless more than 96 pieces crowd there; farther off a distance may come out some millimetres too long.
+    be nearer is left out, unless more than 96 pieces crowd there; farther off a distance may come out millimetres too long.
     """
 
     def __init__(self, mesh: Mesh) -> None:

@@ -33,4 +33,5 @@ def read_any_mesh(path: str | Path) -> Mesh:
         whole = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
         return Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32))
     except Exception as error:  # its readers raise whatever they stumble over
-        raise FileError(f"{path}: cannot be read as a mesh ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from None
+        reason = " ".join(str(error).split())[:200]
+        raise FileError(f"{path}: cannot be read as a mesh ({type(error).__name__}: {reason})") from None

@@ -37,8 +37,8 @@ class Run:
         try:
             return open_dataset(self.format, self.path, **self.reading)
         except DatasetError as error:
-            raise DatasetError(f"{self.directory} was made from {self.format} {self.path or ''}, which cannot be opened: {error}") \
-                from None
+            raise DatasetError(f"{self.directory} was made from {self.format} {self.path or ''}, which cannot be opened: "
+                               f"{error}") from None
 
     def config(self) -> Config:
         """The settings of the run."""
@@ -68,7 +68,8 @@ class Run:
                 numbers.append(index)
                 poses.append(frame.T_world_camera)
         if not poses:
-            raise DatasetError(f"{recording.name}: has no poses of the {len(self.used)} frames that {self.directory} was made from")
+            raise DatasetError(f"{recording.name}: has no poses of the {len(self.used)} frames that {self.directory} was made "
+                               "from")
         return Trajectory(np.array(numbers if None in stamps else stamps, np.float64), np.stack(poses))
 
     def views(self) -> Views:

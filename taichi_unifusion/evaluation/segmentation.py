@@ -62,8 +62,8 @@ def evaluate_segmentation(predicted: NDArray, truth: NDArray, *, names: Mapping[
     """
     predicted, truth = _labels(predicted, "predicted labels"), _labels(truth, "true labels")
     if len(predicted) != len(truth):
-        raise InputError(f"segmentation: {len(predicted)} predicted labels but {len(truth)} true ones; both must be of the same "
-                         "points")
+        raise InputError(f"segmentation: {len(predicted)} predicted labels but {len(truth)} true ones; both must be of the "
+                         "same points")
     known = np.unique(truth)
     labels = known[~np.isin(known, list(ignore)) & (np.isin(known, list(names)) if names is not None else True)]
     if not len(labels):
@@ -78,8 +78,8 @@ def evaluate_segmentation(predicted: NDArray, truth: NDArray, *, names: Mapping[
     matrix = confusion_matrix(predicted, truth, labels)
     right, of_truth, given = np.diag(matrix), matrix.sum(axis=1), matrix[:, :-1].sum(axis=0)
     iou, accuracy = right / (of_truth + given - right), right / of_truth
-    classes = tuple(ClassScore(label, names[label] if names else str(label), float(iou[i]), float(accuracy[i]), int(of_truth[i]),
-                               label not in unseen) for i, label in enumerate(labels.tolist()))
+    classes = tuple(ClassScore(label, names[label] if names else str(label), float(iou[i]), float(accuracy[i]),
+                               int(of_truth[i]), label not in unseen) for i, label in enumerate(labels.tolist()))
     whole = _group(classes)
     return SegmentationResult(
         whole.mean_iou, whole.mean_accuracy, float(right.sum() / len(truth)),

@@ -51,8 +51,8 @@ def evaluate_surface(reconstruction: Mesh, ground_truth: Mesh, *, views: Views |
                      distance_to: Literal["surface", "samples"] = "surface") -> SurfaceResult:
     """Compare two meshes by `samples` points drawn evenly from each, both in world coordinates [m].
 
-    Distances are to the other *surface*. "samples" measures to its samples instead, as published: the same where they lie dense,
-    but 100,000 samples of 100 m^2 of surface are 3 cm apart, and even a perfect mesh fails a threshold of 1 cm.
+    Distances are to the other *surface*. "samples" measures to its samples instead, as published: the same where they lie
+    dense, but 100,000 samples of 100 m^2 of surface are 3 cm apart, and even a perfect mesh fails a threshold of 1 cm.
 
     With `views`, only what those cameras could tell is compared:
     * a true point counts if a camera saw it: inside the image, in the depth range, nothing of the truth in front of it;

@@ -131,8 +131,8 @@ def _matched(estimate: Trajectory, ground_truth: Trajectory, max_difference: flo
     if len(pairs) < FEWEST:
         spans = [f"{t.timestamps[0]:.9g} to {t.timestamps[-1]:.9g} s" if len(t) else "nothing"
                  for t in (estimate, ground_truth)]
-        raise InputError(f"trajectory: {len(pairs)} of {len(estimate)} estimated poses lie within {max_difference:g} s of a true "
-                         f"one, {FEWEST} are needed; the estimate covers {spans[0]} and the ground truth {spans[1]}")
+        raise InputError(f"trajectory: {len(pairs)} of {len(estimate)} estimated poses lie within {max_difference:g} s of a "
+                         f"true one, {FEWEST} are needed; the estimate covers {spans[0]} and the ground truth {spans[1]}")
     return estimate.T_world_camera[pairs[:, 0]], ground_truth.T_world_camera[pairs[:, 1]]
 
 

@@ -38,7 +38,7 @@ def points_within_view(views: Views, mesh: Mesh, points: tuple[NDArray, ...], be
     """For each set of points (N, 3) world [m]: which (N,) lie in the view of at least one camera.
 
     In view means: inside the image, in the depth range, and no more than `behind` metres (one number a set) deeper than the
-    first surface of `mesh` on the same ray; a ray that hits nothing is free to the end of the range. All sets share the casting.
+    first surface of `mesh` on the same ray; a ray that hits nothing is free to the end of the range.
     """
     caster = RayCaster(mesh, "ground truth")
     points = tuple(np.asarray(p, np.float64) for p in points)

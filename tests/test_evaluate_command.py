@@ -1,0 +1,443 @@
+"""`unifusion evaluate` as a user meets it: which frames and meshes it takes, tables, JSON, one sentence for what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from meshes import joined, mesh_of, rectangle
+from tiny_recording import DEVICE, FLAGS, make_frames, write_folder
+
+from taichi_unifusion import Trajectory, cli, load_map, open_dataset
+from taichi_unifusion.errors import FileError, InputError, UniFusionError
+from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface, geometry
+from taichi_unifusion.evaluation.label_files import read_class_names, read_labels
+from taichi_unifusion.evaluation.mesh_files import read_any_mesh
+from taichi_unifusion.evaluation.runs import read_run
+from taichi_unifusion.io import read_mesh, read_trajectory, write_trajectory
+
+FRAMES, EVERY = 7, 3     # frames 0, 3 and 6 are used
+SAMPLES = "3000"
+SAME = 1e-6              # relative: the same code on the same files
+
+
+@pytest.fixture(autouse=True)
+def coarse_pieces(monkeypatch):
+    """Distances a little less exact and much sooner: here they only have to be the same everywhere."""
+    monkeypatch.setattr(geometry, "PIECE_M", 0.3)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return write_folder(tmp_path_factory.mktemp("data") / "recording", make_frames(FRAMES))
+
+
+@pytest.fixture(scope="module")
+def results(recording, tmp_path_factory):
+    """A results folder; tests that change it work on a copy."""
+    out = tmp_path_factory.mktemp("results") / "made"
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--every", str(EVERY), "--mesh.formats", "ply",
+                     "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    path = tmp_path_factory.mktemp("truth") / "room.ply"
+    open_dataset("synthetic").ground_truth_mesh().save(path)
+    return path
+
+
+@pytest.fixture
+def evaluate(capsys):
+    """Runs the command and gives its JSON, after it ended well."""
+    def run(*arguments):
+        capsys.readouterr()
+        assert cli.main(["evaluate", *map(str, arguments), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return run
+
+
+@pytest.fixture
+def told(capsys):
+    """Runs the command and gives what it says on its way to exit code 2."""
+    def run(*arguments):
+        capsys.readouterr()
+        assert cli.main(["evaluate", *map(str, arguments)]) == 2
+        captured = capsys.readouterr()
+        assert captured.out == "" and "Traceback" not in captured.err
+        return " ".join(captured.err.replace("│", " ").split())
+
+    return run
+
+
+def with_metrics(results: Path, folder: Path, **changes) -> Path:
+    """A copy of the results folder whose metrics.json says something else about the recording."""
+    shutil.copytree(results, folder)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["recording"].update(changes)
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder
+
+
+# --- What a results folder says -------------------------------------------------------------------------------------
+
+
+def test_a_run_knows_its_frames_camera_and_poses(results, recording):
+    run = read_run(results)
+    assert (run.format, run.path, run.used) == ("folder", recording, (0, 3, 6))
+    assert run.camera == make_frames(1)[0].camera and len(run.recording()) == FRAMES
+    np.testing.assert_allclose(run.trajectory().T_world_camera, run.true_trajectory().T_world_camera, atol=1e-8)
+    limits = run.config().preprocess
+    assert (run.views().depth_min, run.views().depth_max) == (limits.depth_min, limits.depth_max)
+
+
+@pytest.mark.parametrize(("frames", "used"), [
+    ({"used": 2, "skipped_frames": [{"frame": 3, "message": ""}]}, (0, 6)),
+    ({"used": 1, "skipped_frames": []}, (0,)),                                # stopped after the first
+    ({"used": 1, "skipped_frames": [{"frame": 0, "message": ""}]}, (3,)),
+])
+def test_frames_skipped_or_never_reached_are_not_used(results, tmp_path, frames, used):
+    folder = with_metrics(results, tmp_path / "copy")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["frames"].update(frames)
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    assert read_run(folder).used == used
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"recording": 3, "frames": {}}',
+                                  '{"recording": {"start": "x"}, "frames": {"skipped_frames": []}}'])
+def test_damaged_metrics_are_told(results, tmp_path, text):
+    folder = with_metrics(results, tmp_path / "copy")
+    (folder / "metrics.json").write_text(text)
+    with pytest.raises(FileError, match="not the metrics of a run"):
+        read_run(folder)
+
+
+# --- surface --------------------------------------------------------------------------------------------------------
+
+
+def test_surface_of_a_results_folder_is_judged_by_what_its_frames_saw(results, truth, evaluate):
+    found = evaluate("surface", results, truth, "--samples", SAMPLES)
+    run = read_run(results)
+    limits = run.config().preprocess
+    views = Views(run.camera, run.trajectory().T_world_camera, limits.depth_min, limits.depth_max)
+    known = evaluate_surface(run.mesh(), read_mesh(truth), views=views, samples=int(SAMPLES))
+    assert found["accuracy_cm"] == pytest.approx(known.accuracy_cm, rel=SAME)
+    assert [s["f1"] for s in found["scores"]] == pytest.approx([s.f1 for s in known.scores], rel=SAME)
+    assert found["ground_truth_unseen"] > 0.5 and found["seen_by"] == str(results)
+    whole = evaluate("surface", results, truth, "--whole", "--samples", SAMPLES, "--thresholds", "0.05")
+    seen = evaluate("surface", results, truth, "--samples", SAMPLES, "--thresholds", "0.05")
+    assert whole["scores"][0]["recall"] < 0.5 < seen["scores"][0]["recall"]
+    assert (whole["ground_truth_unseen"], whole["seen_by"], len(whole["scores"])) == (0, None, 1)
+
+
+def test_surface_of_a_mesh_file_is_judged_whole_or_by_another_run(results, truth, evaluate, tmp_path):
+    mesh = shutil.copy(results / "mesh.ply", tmp_path / "other.ply")
+    assert evaluate("surface", mesh, truth, "--samples", SAMPLES)["ground_truth_unseen"] == 0
+    seen = evaluate("surface", mesh, truth, "--seen-by", results, "--samples", SAMPLES)
+    assert seen["scores"] == evaluate("surface", results, truth, "--samples", SAMPLES)["scores"]
+
+
+def test_surface_without_a_truth_takes_the_recordings_own(results, truth, evaluate, tmp_path):
+    folder = with_metrics(results, tmp_path / "copy", format="synthetic", path="")
+    own, given = (evaluate("surface", *arguments, "--samples", SAMPLES) for arguments in ((folder,), (folder, truth)))
+    assert own["scores"] == given["scores"] and own["ground_truth"] == "the recording's"
+
+
+def test_surface_table_and_file(results, truth, capsys, tmp_path):
+    file = tmp_path / "scores" / "surface.json"
+    assert cli.main(["evaluate", "surface", str(results), str(truth), "--samples", SAMPLES, "--to", "samples",
+                     "--out", str(file)]) == 0
+    captured, written = capsys.readouterr(), json.loads(file.read_text())
+    lines = captured.out.splitlines()
+    assert lines[0].split() == ["within", "cm", "precision", "%", "recall", "%", "F1", "%"]
+    assert float(lines[1].split()[-1]) == pytest.approx(100 * written["scores"][0]["f1"], abs=0.051)
+    assert "3 frames could tell" in captured.out and written["distance_to"] == "samples" and "\x1b" not in captured.out
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj", ".stl", ".off"])
+def test_meshes_of_other_programs_are_read(suffix, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    mesh = joined(rectangle((0, 0), (1, 2), 0.5), rectangle((3, 0), (4, 1), 0.0))
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / f"mesh{suffix}")
+    found = read_any_mesh(tmp_path / f"mesh{suffix}")
+    assert len(found.faces) == 4
+    np.testing.assert_allclose(np.sort(found.vertices[found.faces].reshape(-1, 3), axis=0),
+                               np.sort(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0), atol=1e-6)
+
+
+# --- rendering ------------------------------------------------------------------------------------------------------
+
+
+def test_rendering_takes_held_out_frames_half_way_between_the_used_ones(results, recording, evaluate):
+    found = evaluate("rendering", results)
+    assert [frame["index"] for frame in found["frames"]] == [1, 4] and found["used_by_the_run"] == []
+    limits = read_run(results).config().preprocess
+    frames = open_dataset("folder", recording)
+    known = evaluate_rendering(read_mesh(results / "mesh.ply"), [frames[1], frames[4]],
+                               color=load_map(results / "maps" / "color.safetensors").query,
+                               depth_min=limits.depth_min, depth_max=limits.depth_max)
+    for name in ("depth_l1_cm", "depth_median_cm", "coverage", "psnr_db", "ssim"):
+        assert found[name] == pytest.approx(getattr(known, name), rel=1e-4)  # the map's kernels are compiled anew
+    assert found["depth_l1_cm"] < 20 and found["coverage"] > 0.5 and found["psnr_db"] > 15
+
+
+@pytest.mark.parametrize(("flags", "frames", "used"), [
+    (["--start", "2"], [2, 4, 5], []),
+    (["--end", "4"], [1, 2], []),
+    (["--every", "2", "--all"], [0, 2, 4, 6], [0, 6]),
+    (["--start", "3", "--end", "5", "--all"], [3, 4], [3]),
+    (["--all", "--end", "1"], [0], [0]),
+])
+def test_rendering_takes_the_frames_that_are_asked_for(results, evaluate, flags, frames, used):
+    found = evaluate("rendering", results, *flags)
+    assert [frame["index"] for frame in found["frames"]] == frames and found["used_by_the_run"] == used
+
+
+def test_rendering_of_a_mesh_file(results, recording, evaluate):
+    found = evaluate("rendering", results / "mesh.ply", "folder", recording, "--end", "2")
+    assert [frame["index"] for frame in found["frames"]] == [0, 1] and found["colour"] == "vertices"
+    own = evaluate("rendering", results, "--vertex-colors", "--all", "--end", "2")
+    assert own["psnr_db"] == pytest.approx(found["psnr_db"]) and own["colour"] == "vertices"
+    assert evaluate("rendering", results, "--all", "--end", "2")["psnr_db"] != found["psnr_db"]
+
+
+def test_rendering_of_a_recording_that_was_moved(results, recording, evaluate, told, tmp_path):
+    moved = shutil.copytree(recording, tmp_path / "elsewhere")
+    lost = with_metrics(results, tmp_path / "copy", path=str(tmp_path / "gone"))
+    assert "was made from folder" in told("rendering", lost)
+    assert [frame["index"] for frame in evaluate("rendering", lost, "folder", moved)["frames"]] == [1, 4]
+
+
+def test_rendering_leaves_out_frames_that_cannot_be_used(results, recording, capsys, tmp_path):
+    spoiled = shutil.copytree(recording, tmp_path / "spoiled")
+    (spoiled / "depth" / "1.png").write_bytes(b"no image")
+    (spoiled / "poses" / "2.txt").write_text("nan " * 16)
+    arguments = ["evaluate", "rendering", str(results), "folder", str(spoiled), "--start", "0", "--end", "5", "--json"]
+    assert cli.main(arguments) == 0
+    captured = capsys.readouterr()
+    assert [frame["index"] for frame in json.loads(captured.out)["frames"]] == [4]
+    assert captured.err.count("frame left out") == 2 and "1.png" in captured.err
+
+
+def test_rendering_table(results, capsys):
+    assert cli.main(["evaluate", "rendering", str(results), "--depth-max", "2.5"]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[0].split("  ")[0] == "depth L1 cm" and "none of which the run has used; colour from the map" in out
+
+
+# --- trajectory -----------------------------------------------------------------------------------------------------
+
+
+def test_trajectory_of_a_results_folder_and_of_files(results, evaluate, tmp_path):
+    assert evaluate("trajectory", results)["ate_unaligned_cm"]["max"] < 1e-5  # the recording's own poses, to 9 digits
+    estimate = read_trajectory(results / "trajectory.txt")
+    poses = estimate.T_world_camera.copy()
+    poses[:, :3, 3] += (0, 0, 0.5)
+    poses[1, 0, 3] += 0.01
+    write_trajectory(tmp_path / "truth.txt", Trajectory(estimate.timestamps + 0.01, poses))
+    for arguments in ((results, tmp_path / "truth.txt"), (results / "trajectory.txt", tmp_path / "truth.txt")):
+        found = evaluate("trajectory", *arguments, "--rpe-delta", "2")
+        assert found["ate_unaligned_cm"]["median"] == pytest.approx(50, abs=0.1) and 0 < found["ate_cm"]["rmse"] < 1
+        assert (found["matches"], found["rpe_delta"], found["rpe_unit"]) == (3, 2, "frames")
+    assert evaluate("trajectory", tmp_path / "truth.txt", results)["matches"] == 3
+
+
+def test_trajectory_table(results, capsys):
+    assert cli.main(["evaluate", "trajectory", str(results), "--rpe-unit", "metres", "--rpe-delta", "99"]) == 0
+    out = capsys.readouterr().out
+    assert "ATE, aligned [cm]" in out and "RPE, translation over 99 metres [cm]" in out and "3 of 3 estimated poses" in out
+
+
+# --- segmentation ---------------------------------------------------------------------------------------------------
+
+
+def test_segmentation_of_every_kind_of_file(evaluate, tmp_path):
+    (tmp_path / "given.txt").write_text("# from a network\n1\n2\n\n2.0\n-1\n")
+    np.save(tmp_path / "true.npy", np.array([1, 2, 1, 2], np.uint8))
+    (tmp_path / "names.txt").write_text("﻿# classes\r\n1 kitchen table\r\n2  lamp\r\n")
+    found = evaluate("segmentation", tmp_path / "given.txt", tmp_path / "true.npy", "--names", tmp_path / "names.txt",
+                     "--unseen", "lamp")
+    assert found["overall_accuracy"] == 0.5 and found["unlabelled"] == 1
+    table, lamp = ((c["name"], c["iou"], c["seen"]) for c in found["classes"])
+    assert (table, lamp) == (("kitchen table", 0.5, True), ("lamp", 1 / 3, False))
+    assert found["unseen"]["mean_iou"] == pytest.approx(1 / 3)
+    by_label = evaluate("segmentation", tmp_path / "given.txt", tmp_path / "true.npy", "--unseen", "2", "--ignore", "1")
+    assert [c["name"] for c in by_label["classes"]] == ["2"] and by_label["seen"] is None
+
+
+def test_segmentation_carries_labels_between_meshes(evaluate, tmp_path):
+    coarse, fine = rectangle((0, 0), (1, 1), 0.0, steps=4), rectangle((0, 0), (1, 1), 0.01, steps=20)
+    for name, mesh in (("coarse", coarse), ("fine", fine)):
+        mesh.with_attribute("class", mesh.vertices[:, 0] > 0.63).save(tmp_path / f"{name}.ply")
+    arguments = ["segmentation", tmp_path / "coarse.ply", tmp_path / "fine.ply", "--attribute", "class", "--max-distance"]
+    assert evaluate(*arguments, "0.3")["overall_accuracy"] == 1
+    assert evaluate(*arguments, "0.05")["unlabelled"] > 0
+    same = evaluate("segmentation", tmp_path / "fine.ply", *arguments[2:], "1e-9")
+    assert same["overall_accuracy"] == 1 and same["unlabelled"] == 0
+
+
+def test_segmentation_table(capsys, tmp_path):
+    for name in ("a.txt", "b.txt"):
+        (tmp_path / name).write_text("0\n0\n1\n")
+    assert cli.main(["evaluate", "segmentation", str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), "--unseen", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["class", "IoU", "%", "accuracy", "%", "points"]
+    assert [line.split() for line in lines[1:3]] == [["0", "100.0", "100.0", "2"], ["1", "*", "100.0", "100.0", "1"]]
+    assert [line.split()[0] for line in lines[4:8]] == ["mean", "all", "seen", "unseen"]
+
+
+def test_M6_an_array_with_a_payload_is_refused_and_not_run(tmp_path):
+    class Payload:
+        def __reduce__(self):
+            return Path.touch, (tmp_path / "ran",)
+
+    (tmp_path / "labels.npy").write_bytes(pickle.dumps(Payload()))
+    np.save(tmp_path / "objects.npy", np.array([Payload()], dtype=object), allow_pickle=True)
+    for name in ("labels.npy", "objects.npy"):
+        with pytest.raises(FileError, match="not an array that NumPy wrote"):
+            read_labels(tmp_path / name)
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(("name", "content", "error", "told_by"), [
+    ("x.txt", b"1\ntwo\n", FileError, "line 2: expected one number, got 'two'"),
+    ("x.txt", b"# nothing\n", FileError, "holds no labels"),
+    ("x.txt", b"\xff\xfe\x00", FileError, "not a text file"),
+    ("x.npy", b"", FileError, "not an array"),
+    ("x.csv", b"1\n", InputError, "labels are read from .ply, .txt, .npy"),
+    ("x.ply", b"plx", FileError, "not a PLY file"),
+])
+def test_bad_label_files_are_told(tmp_path, name, content, error, told_by):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(error, match=told_by):
+        read_labels(tmp_path / name)
+
+
+@pytest.mark.parametrize("array", [np.zeros((3, 2)), np.array(["a"]), np.zeros((0, 2)), np.array(3)])
+def test_arrays_that_are_no_labels_are_told(tmp_path, array):
+    np.save(tmp_path / "x.npy", array)
+    with pytest.raises(InputError, match="expected one number a point"):
+        read_labels(tmp_path / "x.npy")
+
+
+def test_a_mesh_without_labels_names_what_it_has(tmp_path):
+    rectangle((0, 0), (1, 1), 0.0, color=(1, 0, 0)).save(tmp_path / "mesh.ply")
+    with pytest.raises(InputError, match="no vertex property 'label', only color"):
+        read_labels(tmp_path / "mesh.ply")
+    with pytest.raises(InputError, match="'color' has 3 columns"):
+        read_labels(tmp_path / "mesh.ply", "color")
+
+
+@pytest.mark.parametrize(("text", "told_by"), [("chair 3\n", "line 1: expected 'label name'"), ("3\n", "line 1"),
+                                               ("3 chair\n3 sofa\n", "line 2: label 3 has a name already"),
+                                               ("", "holds no names")])
+def test_bad_names_are_told(tmp_path, text, told_by):
+    (tmp_path / "names.txt").write_text(text)
+    with pytest.raises(FileError, match=told_by):
+        read_class_names(tmp_path / "names.txt")
+
+
+# --- Bad input, at the command line ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """Files of every bad kind in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    Path("empty_folder").mkdir()
+    mesh_of([], []).save("empty.ply")
+    mesh_of([(0, 0, 0), (1, 0, 0), (0, 1, np.nan)], [(0, 1, 2)]).save("nan.ply")
+    rectangle((0, 0), (1, 1), 0.0).save("square.ply")
+    rectangle((50, 50), (51, 51), 0.0).save("far.ply")
+    Path("text.ply").write_text("hello")
+    Path("junk.glb").write_bytes(b"glTF\x02junk")
+    Path("poses.txt").write_text("".join(f"{i} {i} 0 0 0 0 0 1\n" for i in range(5)))
+    Path("later.txt").write_text("".join(f"{i + 100} {i} 0 0 0 0 0 1\n" for i in range(5)))
+    Path("nan.txt").write_text("0 nan 0 0 0 0 0 1\n")
+    Path("one.txt").write_text("1\n")
+    Path("two.txt").write_text("1\n2\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), [
+    (["surface", "nowhere.ply", "square.ply"], "nowhere.ply: no such file"),
+    (["surface", "square.ply", "nowhere.ply"], "nowhere.ply: no such file"),
+    (["surface", "square.ply"], "give the true mesh too"),
+    (["surface", "empty_folder", "square.ply"], "empty_folder: holds no metrics.json"),
+    (["surface", "text.ply", "square.ply"], "text.ply: not a PLY file"),
+    (["surface", "junk.glb", "square.ply"], "junk.glb: cannot be read as a mesh"),
+    (["surface", "poses.txt", "square.ply"], "poses.txt: meshes are read from .ply"),
+    (["surface", "empty.ply", "square.ply"], "reconstruction: has no triangles"),
+    (["surface", "nan.ply", "square.ply"], "1 of 3 vertices are not finite"),
+    (["surface", "far.ply", "square.ply"], "do not overlap"),
+    (["surface", "square.ply", "square.ply", "--thresholds", "-1"], "thresholds above 0"),
+    (["surface", "square.ply", "square.ply", "--samples", "0"], "samples >= 1"),
+    (["surface", "square.ply", "square.ply", "--seen-by", "empty_folder"], "empty_folder: holds no metrics.json"),
+    (["surface", "square.ply", "square.ply", "--seen-by", "x", "--whole"], "exclude each other"),
+    (["surface", "square.ply", "square.ply", "--out", "square.ply/x.json"], "square.ply: cannot write"),
+    (["rendering", "square.ply"], "give the recording to compare the mesh with"),
+    (["rendering", "square.ply", "folder", "nowhere"], "nowhere: no such file or folder"),
+    (["rendering", "square.ply", "7scene", "nowhere"], "did you mean '7scenes'?"),
+    (["rendering", "square.ply", "synthetic", "--start", "99"], "there is no frame 99"),
+    (["rendering", "square.ply", "synthetic", "--every", "0"], "every >= 1"),
+    (["trajectory", "poses.txt"], "give the true poses too"),
+    (["trajectory", "poses.txt", "nowhere.txt"], "nowhere.txt: no such file"),
+    (["trajectory", "poses.txt", "later.txt"], "0 of 5 estimated poses lie within 0.02 s"),
+    (["trajectory", "nan.txt", "poses.txt"], "nan.txt, line 1: expected 8 finite numbers"),
+    (["trajectory", "square.ply", "poses.txt"], "square.ply"),
+    (["trajectory", "poses.txt", "poses.txt", "--rpe-delta", "0"], "rpe_delta must be a positive number"),
+    (["segmentation", "one.txt", "two.txt"], "1 predicted labels but 2 true ones"),
+    (["segmentation", "one.txt", "nowhere.txt"], "nowhere.txt: no such file"),
+    (["segmentation", "one.txt", "one.txt", "--ignore", "1"], "every true label is ignored"),
+    (["segmentation", "one.txt", "one.txt", "--unseen", "lamp"], "give --names to use names"),
+    (["segmentation", "square.ply", "one.txt"], "no vertex property 'label'"),
+    (["trajectorie"], "surface, rendering, trajectory, segmentation"),
+    ([], "surface, rendering, trajectory, segmentation"),
+])
+def test_bad_input_is_one_sentence_and_exit_code_2(files, told, arguments, sentence):
+    assert sentence in told(*arguments)
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), [
+    (["surface", "RESULTS"], "a recording of format 'folder' holds no true surface; give one"),
+    (["rendering", "RESULTS", "--every", "3"], "the run has used every one of these frames"),
+    (["rendering", "RESULTS", "--depth-max", "0.01"], "depth_min < depth_max"),
+    (["rendering", "RESULTS", "--depth-min", "50", "--depth-max", "60"], "none of 2 frames has a depth reading"),
+])
+def test_results_that_do_not_fit_are_told(results, told, arguments, sentence):
+    assert sentence in told(*(results if a == "RESULTS" else a for a in arguments))
+
+
+def test_what_a_results_folder_lacks_is_told(results, truth, told, tmp_path):
+    folder = with_metrics(results, tmp_path / "copy", camera=None)
+    assert "does not say which camera" in told("surface", folder, truth)
+    (folder / "mesh.ply").unlink()
+    assert f"make it with: unifusion mesh {folder}" in told("rendering", folder)
+
+
+def test_a_missing_colour_map_is_said_and_vertex_colours_are_judged(results, capsys, tmp_path):
+    folder = with_metrics(results, tmp_path / "copy")
+    (folder / "maps" / "color.safetensors").unlink()
+    assert cli.main(["evaluate", "rendering", str(folder)]) == 0
+    captured = capsys.readouterr()
+    assert "color.safetensors: no such file" in captured.err and "colour from the vertices" in captured.out
+
+
+@pytest.mark.parametrize("metric", ["surface", "rendering", "trajectory", "segmentation"])
+def test_every_metric_has_help(metric, capsys):
+    assert cli.main(["evaluate", metric, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert f"unifusion evaluate {metric}" in out and "Example:" in out and "--json" in out
+
+
+def test_device_and_errors_are_of_this_package():
+    assert DEVICE in ("cpu", "cuda") and issubclass(FileError, UniFusionError)
+    assert dataclasses.is_dataclass(cli.COMMANDS["evaluate"][0])
