@@ -35,9 +35,9 @@ DESCRIPTION = ("RGB-D frames with camera poses in, a coloured surface out.\n\n"
 COMMANDS: dict[str, tuple[type, Callable[..., int] | dict]] = {  # options and function, or a group: its help, its commands
     "reconstruct": (Reconstruct, reconstruct),
     "mesh": (ExtractMesh, extract_mesh),
-    "evaluate": (Evaluate, METRICS),
     "info": (Info, info),
     "config": (ShowConfig, show_config),
+    "evaluate": (Evaluate, METRICS),
 }
 
 
