@@ -9,10 +9,10 @@ from ..errors import InputError
 from ..types import Mesh
 
 PIECE_M = 0.04          # [m] triangles are cut into pieces of at most this edge, to find the nearest ones by their centres
-MAX_PIECES = 4_000_000  # 0.5 GB of search tree; of a larger surface the pieces are larger
+MAX_PIECES = 2_000_000  # 0.3 GB of search tree; of a larger surface the pieces are larger
 CANDIDATES = (24, 96)   # pieces looked at for a point; the second where the first leave a doubt
 EXACT_M = 0.1           # [m] beyond it a doubt is left: the distance is at most the radius of a piece too long
-POINT_CHUNK = 20_000    # points measured at once: some 300 MB of intermediate numbers at most
+POINT_CHUNK = 5_000     # points measured at once: some 150 MB of intermediate numbers at most
 
 
 def check_mesh(mesh: Mesh, name: str) -> Mesh:
@@ -97,13 +97,14 @@ def _pieces(corners: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64], f
     edge = max(PIECE_M, 4 * np.sqrt(area / MAX_PIECES))  # halving leaves pieces of a sixteenth of its square on average
     centers, owners, radius, owner = [], [], 0.0, np.arange(len(corners))
     while len(corners):
-        lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)  # of the edges from corner k to k + 1
-        whole = lengths.max(axis=1) <= edge
+        along = corners[:, [1, 2, 0]] - corners  # the edges from corner k to k + 1
+        squared = np.einsum("nkd,nkd->nk", along, along)
+        whole = squared.max(axis=1) <= edge**2
         center = corners[whole].mean(axis=1)
         centers.append(center)
         owners.append(owner[whole])
         radius = max(radius, np.linalg.norm(corners[whole] - center[:, None], axis=2).max(initial=0.0))
-        corners, owner, first = corners[~whole], owner[~whole], lengths[~whole].argmax(axis=1)
+        corners, owner, first = corners[~whole], owner[~whole], squared[~whole].argmax(axis=1)
         a, b, c = (corners[np.arange(len(corners)), (first + k) % 3] for k in range(3))
         middle = (a + b) / 2
         corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])

@@ -29,9 +29,22 @@ def read_any_mesh(path: str | Path) -> Mesh:
     import trimesh  # a second of import
 
     try:
-        loaded = trimesh.load(path, process=False)
-        whole = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
-        return Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32))
+        return _joined(trimesh.load_scene(path, process=False))
     except Exception as error:  # its readers raise whatever they stumble over
         reason = " ".join(str(error).split())[:200]
         raise FileError(f"{path}: cannot be read as a mesh ({type(error).__name__}: {reason})") from None
+
+
+def _joined(scene) -> Mesh:
+    """The triangles of a trimesh scene, in its own frame; trimesh would join the textures too, at gigabytes."""
+    vertices, faces, count = [], [], 0
+    for node in scene.graph.nodes_geometry:
+        T_scene_part, name = scene.graph[node]
+        part = scene.geometry[name]
+        if hasattr(part, "faces"):  # else lines or points
+            vertices.append(part.vertices @ T_scene_part[:3, :3].T + T_scene_part[:3, 3])
+            faces.append(part.faces + count)
+            count += len(part.vertices)
+    if not faces:
+        raise ValueError("it holds no triangles")
+    return Mesh(np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32))

@@ -41,34 +41,35 @@ def points_within_view(views: Views, mesh: Mesh, points: tuple[NDArray, ...], be
     first surface of `mesh` on the same ray; a ray that hits nothing is free to the end of the range.
     """
     caster = RayCaster(mesh, "ground truth")
-    points = tuple(np.asarray(p, np.float64) for p in points)
-    seen = tuple(np.zeros(len(p), bool) for p in points)
+    left = [np.asarray(p, np.float64) for p in points]      # not seen so far
+    rows = [np.arange(len(p)) for p in left]                # theirs
+    seen = tuple(np.zeros(len(p), bool) for p in left)
     corners = caster.mesh.vertices[caster.mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     for T_world_camera in views.T_world_camera:
         hits = caster.cast(views.camera, T_world_camera)
-        for p, found, slack in zip(points, seen, behind, strict=True):
-            left = np.nonzero(~found)[0]
-            found[left] = _in_view(views, hits, corners[:, 0], normals, p[left], slack)
+        for k, slack in enumerate(behind):
+            inside = _in_view(views, hits, corners[:, 0], normals, left[k], slack)
+            seen[k][rows[k][inside]] = True
+            left[k], rows[k] = left[k][~inside], rows[k][~inside]
     return seen
 
 
 def _in_view(views: Views, hits: RayHits, corner: NDArray, normals: NDArray, points: NDArray,
              slack: float) -> NDArray[np.bool_]:
     """Which points (N, 3) world [m] one camera has in view; `corner` and `normals` are the planes of the triangles."""
-    camera, eye = views.camera, hits.T_world_camera[:3, 3]
-    x, y, z = ((points - eye) @ hits.T_world_camera[:3, :3]).T
+    camera, eye, R_world_camera = views.camera, hits.T_world_camera[:3, 3], hits.T_world_camera[:3, :3]
     inside = np.zeros(len(points), bool)
-    ahead = np.nonzero((z >= views.depth_min) & (z <= views.depth_max))[0]
-    z = z[ahead]
-    u = np.rint(camera.fx * x[ahead] / z + camera.cx).astype(int)
-    v = np.rint(camera.fy * y[ahead] / z + camera.cy).astype(int)
+    z = points @ R_world_camera[:, 2] - eye @ R_world_camera[:, 2]
+    ahead = np.nonzero((z >= views.depth_min) & (z <= views.depth_max))[0]  # few of many points: the rest is done for these
+    to_point, z = points[ahead] - eye, z[ahead]
+    u = np.rint(camera.fx * (to_point @ R_world_camera[:, 0]) / z + camera.cx).astype(int)
+    v = np.rint(camera.fy * (to_point @ R_world_camera[:, 1]) / z + camera.cy).astype(int)
     drawn = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    ahead, u, v, z = ahead[drawn], u[drawn], v[drawn], z[drawn]
+    ahead, to_point, u, v, z = ahead[drawn], to_point[drawn], u[drawn], v[drawn], z[drawn]
 
     triangle = hits.triangle[v, u]
     depth = np.where(triangle >= 0, hits.depth[v, u].astype(np.float64), 0.0)
-    to_point = points[ahead] - eye
     normal = normals[triangle]
     with np.errstate(divide="ignore", invalid="ignore"):  # a plane that holds the ray: its depth at the pixel's centre counts
         there = z * np.einsum("nd,nd->n", normal, corner[triangle] - eye) / np.einsum("nd,nd->n", normal, to_point)
