@@ -49,7 +49,6 @@ class RayCaster:
 
     def __init__(self, mesh: Mesh, name: str = "mesh") -> None:
         self.mesh = check_mesh(mesh, name)
-        self._both_sides = np.ascontiguousarray(np.concatenate([self.mesh.faces, self.mesh.faces[:, ::-1]]))
 
     def cast(self, camera: PinholeCamera, T_world_camera: NDArray) -> RayHits:
         """What every pixel of the camera sees; raises PoseError for a pose that is no rigid transform."""
@@ -59,12 +58,11 @@ class RayCaster:
 
         projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(T_world_camera)[:3])
         nearest = np.empty((camera.height, camera.width), np.int64)
-        rasterize(self.mesh.vertices, self._both_sides, projection, NEAR, nearest)
+        rasterize(self.mesh.vertices, self.mesh.faces, 1, projection, NEAR, nearest)
         empty = nearest == EMPTY
         depth = (nearest >> 32).astype(np.int32).view(np.float32)
-        triangle = (nearest & 0xFFFFFFFF).astype(np.int64) % len(self.mesh.faces)
-        return RayHits(np.where(empty, np.float32(np.inf), depth), np.where(empty, -1, triangle).astype(np.int32),
-                       camera, T_world_camera)
+        triangle = np.where(empty, -1, nearest & 0xFFFFFFFF).astype(np.int32)
+        return RayHits(np.where(empty, np.float32(np.inf), depth), triangle, camera, T_world_camera)
 
     def interpolate(self, hits: RayHits, mask: NDArray[np.bool_], values: NDArray) -> NDArray[np.float32]:
         """Vertex values (V, c), linear over each triangle, at the points that the pixels in `mask` hit: (N, c)."""
