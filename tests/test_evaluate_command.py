@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import pickle
 import shutil
@@ -10,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from meshes import joined, mesh_of, rectangle
-from tiny_recording import DEVICE, FLAGS, make_frames, write_folder
+from meshes import joined, mesh_of, random_rigid, rectangle
+from tiny_recording import FLAGS, make_frames, write_folder
 
 from taichi_unifusion import Trajectory, cli, load_map, open_dataset
-from taichi_unifusion.errors import FileError, InputError, UniFusionError
+from taichi_unifusion.errors import FileError, InputError
 from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface, geometry
 from taichi_unifusion.evaluation.label_files import read_class_names, read_labels
 from taichi_unifusion.evaluation.mesh_files import read_any_mesh
@@ -92,7 +91,8 @@ def with_metrics(results: Path, folder: Path, **changes) -> Path:
 def test_a_run_knows_its_frames_camera_and_poses(results, recording):
     run = read_run(results)
     assert (run.format, run.path, run.used) == ("folder", recording, (0, 3, 6))
-    assert run.camera == make_frames(1)[0].camera and len(run.recording()) == FRAMES
+    assert run.views().camera == make_frames(1)[0].camera and len(run.recording()) == FRAMES
+    assert (run.T_recording_run() == np.eye(4)).all()
     np.testing.assert_allclose(run.trajectory().T_world_camera, run.true_trajectory().T_world_camera, atol=1e-8)
     limits = run.config().preprocess
     assert (run.views().depth_min, run.views().depth_max) == (limits.depth_min, limits.depth_max)
@@ -127,7 +127,8 @@ def test_surface_of_a_results_folder_is_judged_by_what_its_frames_saw(results, t
     found = evaluate("surface", results, truth, "--samples", SAMPLES)
     run = read_run(results)
     limits = run.config().preprocess
-    views = Views(run.camera, run.trajectory().T_world_camera, limits.depth_min, limits.depth_max)
+    camera = make_frames(1)[0].camera
+    views = Views(camera, run.trajectory().T_world_camera, limits.depth_min, limits.depth_max)
     known = evaluate_surface(run.mesh(), read_mesh(truth), views=views, samples=int(SAMPLES))
     assert found["accuracy_cm"] == pytest.approx(known.accuracy_cm, rel=SAME)
     assert [s["f1"] for s in found["scores"]] == pytest.approx([s.f1 for s in known.scores], rel=SAME)
@@ -231,6 +232,28 @@ def test_rendering_table(results, capsys):
     assert cli.main(["evaluate", "rendering", str(results), "--depth-max", "2.5"]) == 0
     out = capsys.readouterr().out
     assert out.splitlines()[0].split("  ")[0] == "depth L1 cm" and "none of which the run has used; colour from the map" in out
+
+
+# --- Runs whose poses were tracked --------------------------------------------------------------------------------------
+
+
+def test_a_tracked_run_is_fitted_to_the_recording(results, truth, evaluate, tmp_path, caplog):
+    """As if a tracker had found every pose, but for its own choice of the world."""
+    T, folder = random_rigid(1), with_metrics(results, tmp_path / "copy")
+    metrics = json.loads((folder / "metrics.json").read_text()) | {"tracking": {"mode": "rgbd"}}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    mesh, path = read_mesh(folder / "mesh.ply"), read_trajectory(folder / "trajectory.txt")
+    geometry.transformed(mesh, T).save(folder / "mesh.ply")
+    write_trajectory(folder / "trajectory.txt", Trajectory(path.timestamps, T @ path.T_world_camera))
+    np.testing.assert_allclose(read_run(folder).T_recording_run() @ T, np.eye(4), atol=1e-6)
+    there, here = (evaluate("surface", of, truth, "--samples", SAMPLES) for of in (folder, results))
+    assert there["accuracy_cm"] == pytest.approx(here["accuracy_cm"], abs=1e-3)
+    assert there["ground_truth_unseen"] == pytest.approx(here["ground_truth_unseen"], abs=1e-3)
+    there, here = (evaluate("rendering", of, "--vertex-colors") for of in (folder, results))
+    assert there["depth_median_cm"] == pytest.approx(here["depth_median_cm"], abs=1e-2)
+    assert there["psnr_db"] == pytest.approx(here["psnr_db"], abs=0.05)
+    assert "its world is fitted to the recording's, 0.0 cm off" in caplog.text
+    assert evaluate("trajectory", folder)["ate_cm"]["max"] < 1e-4
 
 
 # --- trajectory -----------------------------------------------------------------------------------------------------
@@ -417,8 +440,8 @@ def test_results_that_do_not_fit_are_told(results, told, arguments, sentence):
 
 
 def test_what_a_results_folder_lacks_is_told(results, truth, told, tmp_path):
-    folder = with_metrics(results, tmp_path / "copy", camera=None)
-    assert "does not say which camera" in told("surface", folder, truth)
+    folder = with_metrics(results, tmp_path / "copy", path="gone")
+    assert "gone: no such file or folder" in told("surface", folder, truth)
     (folder / "mesh.ply").unlink()
     assert f"make it with: unifusion mesh {folder}" in told("rendering", folder)
 
@@ -436,8 +459,3 @@ def test_every_metric_has_help(metric, capsys):
     assert cli.main(["evaluate", metric, "--help"]) == 0
     out = capsys.readouterr().out
     assert f"unifusion evaluate {metric}" in out and "Example:" in out and "--json" in out
-
-
-def test_device_and_errors_are_of_this_package():
-    assert DEVICE in ("cpu", "cuda") and issubclass(FileError, UniFusionError)
-    assert dataclasses.is_dataclass(cli.COMMANDS["evaluate"][0])

@@ -12,7 +12,7 @@ from meshes import random_rigid
 from taichi_unifusion import Trajectory
 from taichi_unifusion.errors import InputError, PoseError
 from taichi_unifusion.evaluation import evaluate_trajectory
-from taichi_unifusion.evaluation.trajectory import align, rotation_angle
+from taichi_unifusion.evaluation.trajectory import align, align_poses, rotation_angle
 
 ROUNDING = 1e-6  # [cm] float64 over a few metres
 SAME = 1e-9      # relative to another float64 implementation
@@ -44,7 +44,8 @@ def curve(count: int = 40, seed: int = 0) -> Trajectory:
 
 def noisy(trajectory: Trajectory, seed: int = 1, size: float = 0.01) -> Trajectory:
     rng = np.random.default_rng(seed)
-    poses = [T @ shift(*rng.normal(0, size, 3)) @ turn(int(rng.integers(3)), rng.normal(0, 1)) for T in trajectory.T_world_camera]
+    poses = [T @ shift(*rng.normal(0, size, 3)) @ turn(int(rng.integers(3)), rng.normal(0, 1))
+             for T in trajectory.T_world_camera]
     return Trajectory(trajectory.timestamps, np.stack(poses))
 
 
@@ -149,6 +150,15 @@ def test_alignment_is_the_best():
             assert np.square(x @ R.T + best.t + rng.normal(0, size, 3) - y).sum() > cost
     assert np.linalg.det(best.R) == pytest.approx(1)
     assert np.square(align(x, y, with_scale=True)(x) - y).sum() <= cost
+
+
+def test_poses_are_aligned_by_their_orientations():
+    truth, T = line(10).T_world_camera, random_rigid(8)
+    np.testing.assert_allclose(align_poses(T @ truth, truth), np.linalg.inv(T), atol=1e-12)  # a line: positions leave it open
+    rough = noisy(line(400), 2, 0.01).T_world_camera
+    found = align_poses(T @ rough, line(400).T_world_camera) @ T  # one degree and one centimetre of noise, in 400 poses
+    assert np.degrees(rotation_angle(found[None, :3, :3]))[0] < 0.3 and np.linalg.norm(found[:3, 3]) < 0.3
+    assert np.linalg.det(found) == pytest.approx(1)
 
 
 def test_a_mirrored_path_is_not_aligned_by_a_mirror():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -17,6 +17,8 @@ from .recording import FORMAT_DEFAULT
 from .scores import ScoreOptions, cell, percent
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from ..evaluation.runs import Run
     from ..types import Frame
 
@@ -64,6 +66,8 @@ class EvaluateRendering(ScoreOptions):
 def evaluate_rendering(options: EvaluateRendering) -> int:
     """Mesh, map, frames -> table."""
     options.check_out()
+    import numpy as np
+
     from .. import runtime
     from ..config import Config
     from ..evaluation.mesh_files import read_any_mesh
@@ -73,13 +77,13 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
 
     run = read_run(options.reconstruction) if options.reconstruction.is_dir() else None
     mesh = run.mesh() if run else read_any_mesh(options.reconstruction)
-    recording = _recording(options, run)
+    recording, run = _recording(options, run)
     chosen = choose_frames(options, run, len(recording), recording.name)
     limits = run.config().preprocess if run else Config().preprocess
     runtime.init(options.device)
-    color = _color_map(options, run)
+    color, T_run_recording = _color_map(options, run), np.linalg.inv(run.T_recording_run()) if run else np.eye(4)
     with frame_progress(len(chosen)) as on_frame:
-        result = evaluate(mesh, _usable(recording, chosen, on_frame), color=color.query if color else None,
+        result = evaluate(mesh, _usable(recording, chosen, T_run_recording, on_frame), color=color.query if color else None,
                           depth_min=limits.depth_min if options.depth_min is None else options.depth_min,
                           depth_max=limits.depth_max if options.depth_max is None else options.depth_max)
     used = set(run.used if run else ()) & {score.index for score in result.frames}
@@ -93,15 +97,20 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     return options.show(about, result, format_table(rows), f"{compared}; colour from the {'map' if color else 'vertices'}.")
 
 
-def _recording(options: EvaluateRendering, run: Run | None) -> Dataset:
-    reading = {} if options.depth_scale is None else {"depth_scale": options.depth_scale}
-    if options.format is not None:
-        same_format = run is not None and run.format == options.format
-        return open_dataset(options.format, options.path, **{**(run.reading if same_format else {}), **reading})
+def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Run | None]:
+    """The recording to compare with, and the run as if it were made from it."""
+    given = {} if options.depth_scale is None else {"depth_scale": options.depth_scale}
     if run is None:
-        raise InputError("rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT "
-                         "PATH")
-    return replace(run, reading={**run.reading, **reading}).recording()
+        if options.format is None:
+            raise InputError("rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT "
+                             "PATH")
+        return open_dataset(options.format, options.path, **given), None
+    if options.format is None:
+        run = replace(run, reading={**run.reading, **given})
+    else:
+        run = replace(run, format=options.format, path=options.path,
+                      reading={**(run.reading if run.format == options.format else {}), **given})
+    return run.recording(), run
 
 
 def choose_frames(options: EvaluateRendering, run: Run | None, count: int, name: str) -> Sequence[int]:
@@ -124,8 +133,9 @@ def choose_frames(options: EvaluateRendering, run: Run | None, count: int, name:
     return held_out
 
 
-def _usable(recording: Dataset, chosen: Sequence[int], on_frame) -> Iterator[Frame]:
-    """The frames that can be read and have a pose; the others are said."""
+def _usable(recording: Dataset, chosen: Sequence[int], T_run_recording: NDArray,
+            on_frame: Callable[[int, int], None]) -> Iterator[Frame]:
+    """The frames that can be read and have a pose, in the run's world; the others are said."""
     for done, index in enumerate(chosen, start=1):
         try:
             frame = recording[index]
@@ -135,7 +145,7 @@ def _usable(recording: Dataset, chosen: Sequence[int], on_frame) -> Iterator[Fra
         if frame is not None and frame.T_world_camera is None:
             logger.warning("frame left out: %s: there is no pose for it", frame.name or index)
         elif frame is not None:
-            yield frame
+            yield replace(frame, T_world_camera=T_run_recording @ frame.T_world_camera)
         on_frame(done, len(chosen))
 
 

@@ -49,17 +49,18 @@ def evaluate_surface(options: EvaluateSurface) -> int:
         raise InputError("surface: --whole and --seen-by exclude each other")
     options.check_out()
     from .. import runtime
+    from ..evaluation.geometry import transformed
     from ..evaluation.mesh_files import read_any_mesh
     from ..evaluation.runs import read_run
     from ..evaluation.surface import evaluate_surface as evaluate
 
     run = read_run(options.reconstruction) if options.reconstruction.is_dir() else None
     judge = run if options.seen_by is None else read_run(options.seen_by)
-    mesh = run.mesh() if run else read_any_mesh(options.reconstruction)
-    views = judge.views() if judge and not options.whole else None
     if options.ground_truth is None and judge is None:
         raise InputError("surface: give the true mesh too: unifusion evaluate surface MESH TRUTH")
     runtime.init(options.device)
+    mesh = transformed(run.mesh(), run.T_recording_run()) if run else read_any_mesh(options.reconstruction)
+    views = judge.views() if judge and not options.whole else None
     truth = _own_truth(judge) if options.ground_truth is None else read_any_mesh(options.ground_truth)
     result = evaluate(mesh, truth, views=views, thresholds=options.thresholds, samples=options.samples, seed=options.seed,
                       distance_to=options.to)

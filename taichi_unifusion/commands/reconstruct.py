@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +14,6 @@ from tyro.conf import FlagCreatePairsOff, arg
 from ..config import Config
 from ..datasets import Dataset
 from ..interrupts import INTERRUPTED, stop_on_signal
-from ..loading import recording_of
 from ..terminal import frame_progress, report, summarize
 from .recording import RecordingOptions
 
@@ -71,9 +70,7 @@ def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop:
     if done < len(frames):
         logger.warning("%s after %d of %d frames; writing what they gave", "stopped" if run.interrupted else "ended early",
                        done, len(frames))
-    camera = getattr(recording_of(frames), "camera", None)
-    about = {**options.about, "frames": len(frames), "camera": asdict(camera) if camera else None}
-    results = write_results(directory, pipeline, run, {"recording": about})
+    results = write_results(directory, pipeline, run, {"recording": {**options.about, "frames": len(frames)}})
     print(json.dumps(results.metrics, indent=2) if options.json else summarize(results.metrics, results.files, directory))
     code = report([error for error in (run.failure, *results.failures) if error])
     return INTERRUPTED if stop() else code

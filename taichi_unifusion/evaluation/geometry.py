@@ -40,6 +40,12 @@ def triangle_areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
     return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
+def transformed(mesh: Mesh, T_b_a: NDArray) -> Mesh:
+    """The triangles and attributes of a mesh, given in frame a, in frame b; without normals."""
+    vertices = mesh.vertices @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    return Mesh(vertices.astype(np.float32), mesh.faces, None, mesh.attributes)
+
+
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """`count` points (N, 3) drawn evenly over the area of a checked mesh.
 

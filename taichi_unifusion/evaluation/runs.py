@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..config import Config, load_config
 from ..datasets import Dataset, open_dataset
 from ..errors import DatasetError, FileError, FrameError
 from ..io import read_bytes, read_mesh, read_trajectory
-from ..types import Mesh, PinholeCamera, Trajectory
+from ..types import Mesh, Trajectory
+from .trajectory import align_poses, match_poses
 from .visibility import Views
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a results folder of `unifusion reconstruct` says about itself."""
+    """What a results folder of `unifusion reconstruct` says about itself; its mesh, maps and poses are in its own world."""
 
     directory: Path
     format: str
@@ -30,7 +35,7 @@ class Run:
     stop: int
     every: int
     used: tuple[int, ...]          # the frames fused, by their place in the recording
-    camera: PinholeCamera | None   # of the depth images
+    tracked: bool                  # its poses are not the recording's
 
     def recording(self) -> Dataset:
         """The recording that the run read; raises DatasetError where it is no longer there."""
@@ -72,12 +77,22 @@ class Run:
                                "from")
         return Trajectory(np.array(numbers if None in stamps else stamps, np.float64), np.stack(poses))
 
+    def T_recording_run(self) -> NDArray[np.float64]:
+        """Takes the run's world to the recording's: the same, unless poses were tracked; then these are fitted to its own."""
+        if not self.tracked:
+            return np.eye(4)
+        tracked, true = match_poses(self.trajectory(), self.true_trajectory())
+        T = align_poses(tracked, true)
+        off = np.linalg.norm((T @ tracked)[:, :3, 3] - true[:, :3, 3], axis=1)
+        logger.info("the poses of this run were tracked: its world is fitted to the recording's, %.1f cm off in the mean",
+                    100 * off.mean())
+        return T
+
     def views(self) -> Views:
-        """Where its cameras looked from, within the depth that it used; raises FileError where it does not say so."""
-        if self.camera is None:
-            raise FileError(f"{self.directory}/metrics.json: does not say which camera was used; reconstruct again")
+        """Where its cameras looked from, in the recording's world, within the depth that it used."""
         limits = self.config().preprocess
-        return Views(self.camera, self.trajectory().T_world_camera, limits.depth_min, limits.depth_max)
+        camera = self.recording()[self.used[0]].camera
+        return Views(camera, self.T_recording_run() @ self.trajectory().T_world_camera, limits.depth_min, limits.depth_max)
 
 
 def read_run(directory: str | Path) -> Run:
@@ -93,9 +108,8 @@ def read_run(directory: str | Path) -> Run:
         start, every, count = int(about["start"]), int(about["every"]), int(about["frames"])
         asked = range(start, start + count * every, every)
         done = asked[:int(frames["used"]) + len(skipped)]  # it may have been stopped early
-        camera = about.get("camera")
         return Run(directory, str(about["format"]), Path(about["path"]) if about["path"] else None,
                    dict(about.get("reading", {})), start, asked.stop, every, tuple(i for i in done if i not in skipped),
-                   None if camera is None else PinholeCamera(**camera))
+                   bool(metrics.get("tracking")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FileError(f"{file}: not the metrics of a run, or a damaged file ({type(error).__name__}: {error})") from None

@@ -77,7 +77,7 @@ def evaluate_trajectory(estimate: Trajectory, ground_truth: Trajectory, *, max_d
         raise InputError(f"trajectory: rpe_unit '{rpe_unit}' is unknown, choose frames or metres")
     if not (math.isfinite(rpe_delta) and rpe_delta > 0) or (rpe_unit == "frames" and rpe_delta % 1):
         raise InputError(f"trajectory: rpe_delta must be a positive number, whole for frames, got {rpe_delta:g} {rpe_unit}")
-    P, Q = _matched(estimate, ground_truth, max_difference)
+    P, Q = match_poses(estimate, ground_truth, max_difference)
     x, y = P[:, :3, 3], Q[:, :3, 3]
     rigid, similar = align(x, y, with_scale=False), align(x, y, with_scale=True)
     moves = np.ptp(x, axis=0).max() > 0
@@ -109,6 +109,18 @@ def align(source: NDArray, target: NDArray, *, with_scale: bool) -> Alignment:
     return Alignment(R, target_mean - scale * R @ source_mean, scale, bool(spread[1] > RELATIVE_RANK * spread[0]))
 
 
+def align_poses(source: NDArray, target: NDArray) -> NDArray[np.float64]:
+    """The rigid transform (4, 4) that takes poses (N, 4, 4) nearest to others: the mean rotation, then the mean translation.
+
+    Orientations count, positions do not turn it: unlike `align` it is well-determined for a camera that moves little.
+    """
+    U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", target[:, :3, :3], source[:, :3, :3]))
+    T = np.eye(4)
+    T[:3, :3] = (U * np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])) @ Vt
+    T[:3, 3] = (target[:, :3, 3] - source[:, :3, 3] @ T[:3, :3].T).mean(axis=0)
+    return T
+
+
 def rotation_angle(R: NDArray) -> NDArray[np.float64]:
     """Angles (N,) [rad] of rotation matrices (N, 3, 3); exact for small ones too, where the trace alone is not."""
     sine = 0.5 * np.linalg.norm([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=0)
@@ -125,11 +137,12 @@ def _checked(trajectory: Trajectory, name: str) -> Trajectory:
     return Trajectory(stamps[order], poses[order])
 
 
-def _matched(estimate: Trajectory, ground_truth: Trajectory, max_difference: float) -> tuple[NDArray, NDArray]:
-    """Matched poses (N, 4, 4) of both, in time order."""
+def match_poses(estimate: Trajectory, ground_truth: Trajectory,
+                max_difference: float = MAX_DIFFERENCE) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Poses (N, 4, 4) of both, both in time order, whose stamps belong together; raises InputError for fewer than three."""
     pairs = associate(estimate.timestamps, ground_truth.timestamps, max_difference)
     if len(pairs) < FEWEST:
-        spans = [f"{t.timestamps[0]:.9g} to {t.timestamps[-1]:.9g} s" if len(t) else "nothing"
+        spans = [f"{t.timestamps[0]:.12g} to {t.timestamps[-1]:.12g} s" if len(t) else "nothing"
                  for t in (estimate, ground_truth)]
         raise InputError(f"trajectory: {len(pairs)} of {len(estimate)} estimated poses lie within {max_difference:g} s of a "
                          f"true one, {FEWEST} are needed; the estimate covers {spans[0]} and the ground truth {spans[1]}")
