@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .maps.voxel_grid import VoxelGrid
 
 STEPS = np.array(list(product((0, 1), repeat=3)))  # (8, 3) corners of a cube, x slowest
+SNAP = 1e-4                                        # of an edge: a cut this near to a vertex goes through it
 NORMAL_UNIT = float(1 << 18)                       # fixed-point one of summed normals, in squared grid spacings
 
 
@@ -65,11 +66,13 @@ def cut_mesh(vertices: NDArray[np.float32], faces: NDArray[np.int32], values: ND
     low, high = np.sort(edges, axis=1).astype(np.int64).T
     cut, at = np.unique(low * len(vertices) + high, return_inverse=True)   # an edge is cut once, also between two triangles
     a, b = cut // len(vertices), cut % len(vertices)
-    share = (values[a] / (values[a] - values[b]))[:, None]
-    on_edges = vertices[a] + share * (vertices[b] - vertices[a])
-    i, j, p, q = np.split(len(vertices) + at.reshape(-1), np.cumsum([len(odd_in), len(odd_in), len(odd_out)]))
+    share = values[a] / (values[a] - values[b])
+    on_edges = vertices[a] + share[:, None] * (vertices[b] - vertices[a])
+    number = np.where(share < SNAP, a, np.where(share > 1 - SNAP, b, len(vertices) + np.arange(len(cut))))
+    i, j, p, q = np.split(number[at.reshape(-1)], np.cumsum([len(odd_in), len(odd_in), len(odd_out)]))
     rest = np.concatenate([faces[corners == 3], np.stack([odd_in[:, 0], i, j], axis=1),
                            np.stack([p, odd_out[:, 1], odd_out[:, 2]], axis=1), np.stack([p, odd_out[:, 2], q], axis=1)])
+    rest = rest[(rest != np.roll(rest, 1, axis=1)).all(axis=1)]   # what a cut through a corner makes of a triangle
     return _without_unused(np.concatenate([vertices, on_edges]), rest)
 
 

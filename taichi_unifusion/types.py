@@ -122,6 +122,15 @@ class DepthView:
     camera: PinholeCamera
     T_camera_cloud: NDArray[np.float64]   # (4, 4) from the cloud's frame of reference to the camera's
 
+    def __post_init__(self) -> None:
+        if self.depth.shape != (self.camera.height, self.camera.width) or self.depth.dtype != np.float32:
+            raise SizeMismatch(f"depth view: depth must be ({self.camera.height}, {self.camera.width}) float32 as the camera "
+                               f"is, got {self.depth.shape} {self.depth.dtype}")
+        if not np.isfinite(self.depth.sum()):
+            raise InputError("depth view: depth holds NaN or infinite numbers; 0 means no reading")
+        object.__setattr__(self, "depth", np.ascontiguousarray(self.depth))  # as kernels take it
+        object.__setattr__(self, "T_camera_cloud", check_rigid(self.T_camera_cloud, "T_camera_cloud"))
+
 
 @dataclass(frozen=True)
 class PointCloud:

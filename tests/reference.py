@@ -189,19 +189,19 @@ def unpack_masks(masks):
 
 # ---- Local maps of a frame, and their fusion ----
 
-def encode_points(encoder, samples, targets, *, normals=None, noise, minimum, centered=False):
+def encode_points(encoder, samples, targets, *, normals=None, noise, minimum, centered=False, encode=encode_voxel):
     """Voxel -> (F, w) from single samples, for every voxel whose doubled box holds at least `minimum` of them."""
     local = {}
     for key in rows_by((np.floor(samples - 0.5).astype(int)[:, None] + CORNERS).reshape(-1, 3)):
         t = (samples - key - 0.5) / 2
         inside = np.abs(t).max(axis=1) <= 0.5
         if inside.sum() >= minimum:
-            local[key] = encode_voxel(encoder, t[inside], np.ones(inside.sum()), targets[inside],
-                                      None if normals is None else normals[inside], noise, centered), inside.sum()
+            local[key] = encode(encoder, t[inside], np.ones(inside.sum()), targets[inside],
+                                None if normals is None else normals[inside], noise, centered), inside.sum()
     return local
 
 
-def encode_cells(encoder, cells, *, derivatives=False, noise, minimum, margin, centered=False):
+def encode_cells(encoder, cells, *, derivatives=False, noise, minimum, margin, centered=False, encode=encode_voxel):
     """The same from cell averages (count, mean targets, mean normals), which lie at the cell centres."""
     lattice = np.array(list(cells))
     counts = np.array([cell[0] for cell in cells.values()], float)
@@ -212,16 +212,16 @@ def encode_cells(encoder, cells, *, derivatives=False, noise, minimum, margin, c
             offset = lattice - CELLS * np.array(key)
             near = ((offset >= -margin) & (offset < CELLS + margin)).all(axis=1)
             t = ((offset[near] + 0.5) / CELLS - 0.5) / 2
-            local[key] = encode_voxel(encoder, t, counts[near], targets[near], normals[near] if derivatives else None, noise,
-                                      centered), counts[near].sum()
+            local[key] = encode(encoder, t, counts[near], targets[near], normals[near] if derivatives else None, noise,
+                                centered), counts[near].sum()
     return local
 
 
-def surface_frame(encoder, x, normals, settings):
+def surface_frame(encoder, x, normals, settings, encode=encode_voxel):
     """Local surface LIM of a frame: sample-based (Sec. IV-B.2) or derivative-based (IV-B.1) GPIS."""
     derivatives = settings.gpis == "derivatives"
     steps = [0.0] if derivatives else [-settings.sample_distance, 0.0, settings.sample_distance]
-    options = dict(noise=settings.noise, minimum=settings.min_points)
+    options = dict(noise=settings.noise, minimum=settings.min_points, encode=encode)
     if settings.sampling == "cells":
         cells = bin_surfel_samples(x, normals, steps)
         local = encode_cells(encoder, cells, derivatives=derivatives, margin=settings.margin, **options)
@@ -236,9 +236,10 @@ def surface_frame(encoder, x, normals, settings):
     return {key: Voxel(F, w, masks[key]) for key, (F, w) in local.items()}
 
 
-def property_frame(encoder, x, values, settings):
+def property_frame(encoder, x, values, settings, encode=encode_voxel):
     """Local property LIM of a frame (Eq. 18)."""
-    options = dict(noise=settings.noise, minimum=settings.min_points, centered=settings.prior == "mean")
+    options = dict(noise=settings.noise, minimum=settings.min_points, centered=settings.prior == "mean",
+                   encode=encode)
     cells = bin_points(x, values)
     if settings.sampling == "cells":
         local = encode_cells(encoder, cells, margin=settings.margin, **options)

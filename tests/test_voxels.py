@@ -197,6 +197,36 @@ def test_claim_gather_and_copy_equal_a_dict(cloud):
         np.testing.assert_array_equal(found, written[order])
 
 
+def test_find_release_and_row_copies_equal_a_dict():
+    """A voxel without weight is given up, the others stay; rows follow their slots into a larger pool and out of it."""
+    grid, rng = VoxelGrid(rows=1, channels=1, evidence=True, sums=7), np.random.default_rng(5)
+    keys = np.unique(rng.integers(-9, 9, (500, 3)), axis=0).astype(np.int32)
+    ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
+    grid.claim(len(keys), keys, ones, slots)
+    weights = rng.integers(0, 2, grid.capacity).astype(np.float32)
+    evidence = rng.integers(-127, 128, (grid.capacity, 64), dtype=np.int8)
+    sums = rng.normal(size=(grid.capacity, 7)).astype(np.float32)
+    for pool, values in ((grid.weights, weights), (grid.evidence, evidence), (grid.sums, sums)):
+        pool.from_numpy(values)
+    given = np.where(np.arange(len(keys)) % 3 == 0, -1, slots).astype(np.int32)  # -1: not asked for
+    grid.release(len(keys), keys, given)
+    gone = (given >= 0) & (weights[slots] == 0)
+    assert 0 < gone.sum() == grid.empty and len(grid) == len(keys) - gone.sum()
+    found, wanted = np.empty(len(keys), np.int32), (np.arange(len(keys)) % 2).astype(np.float32)
+    absent = keys + np.int32(100)
+    assert grid.find(len(keys), keys, wanted, found) == (~gone & (wanted > 0)).sum()
+    np.testing.assert_array_equal(found, np.where(~gone & (wanted > 0), slots, -1))
+    assert grid.find(len(keys), absent, ones, found) == 0 and (found == -1).all()
+    weights[slots[(weights[slots] == 0) & ~gone]] = 1  # a map holds no voxel without weight
+    grid.weights.from_numpy(weights)
+    grid.reserve(grid.capacity)
+    data = grid.export()
+    assert list(map(tuple, data.keys.tolist())) == sorted(map(tuple, keys[~gone].tolist()))
+    order = slots[~gone][np.lexsort(keys[~gone].T[::-1])]
+    np.testing.assert_array_equal(data.evidence, evidence[order])
+    np.testing.assert_array_equal(data.sums, sums[order])
+
+
 def test_count_leaves_counts_4x4x4_groups_of_voxels():
     grid = VoxelGrid(rows=1, channels=1)
     assert kernels.count_leaves(grid.leaf_parent) == 0

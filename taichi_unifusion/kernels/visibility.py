@@ -20,33 +20,26 @@ FLAT = 0.2             # a field with a smaller slope than this has no surface t
 
 
 @ti.func
-def to_camera(x: ti.template(), T_camera_world: ti.template()):
-    """A point in world [m], in the camera's frame [m]."""
-    return ti.Vector([T_camera_world[i, 0] * x[0] + T_camera_world[i, 1] * x[1] + T_camera_world[i, 2] * x[2]
-                      + T_camera_world[i, 3] for i in ti.static(range(3))])
-
-
-@ti.func
 def read_behind(p: ti.template(), depth: ti.template(), fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32):
     """How far behind p [m, camera] the reading of its pixel lies [m], and whether there is a reading."""
     behind, known = 0.0, False
     if p[2] > 0:
-        u, v = ti.round(p[0] / p[2] * fx + cx, ti.i32), ti.round(p[1] / p[2] * fy + cy, ti.i32)
-        if u >= 0 and u < depth.shape[1] and v >= 0 and v < depth.shape[0]:
-            reading = depth[v, u]
+        per_depth = 1.0 / p[2]
+        u, v = p[0] * per_depth * fx + cx + 0.5, p[1] * per_depth * fy + cy + 0.5
+        if u >= 0 and v >= 0 and u < depth.shape[1] and v < depth.shape[0]:  # before the cast, which could overflow
+            reading = depth[ti.cast(v, ti.i32), ti.cast(u, ti.i32)]
             behind, known = reading - p[2], reading > 0
     return behind, known
 
 
 @ti.func
-def cell_surface(rank: ti.template(), s: ti.i32, cell: ti.i32, latents: ti.template(), features: ti.template()):
+def cell_surface(rank: ti.template(), F: ti.template(), cell: ti.i32, features: ti.template()):
     """The point of the surface nearest to a cell's centre [voxels from the voxel's corner], its normal, and if there is one."""
     value, slope = 0.0, ti.Vector([0.0, 0.0, 0.0])
     for a in range(rank):
-        F = latents[s, a, 0]
-        value += features[cell, 0, a] * F
+        value += features[cell, 0, a] * F[a]
         for d in ti.static(range(3)):
-            slope[d] += features[cell, 1 + d, a] * F
+            slope[d] += features[cell, 1 + d, a] * F[a]
     steep = slope.norm()
     normal = slope / ti.max(steep, 1e-6)
     distance = value / ti.max(steep, 1e-6)
@@ -58,6 +51,20 @@ def add_votes(evidence: ti.template(), s: ti.i32, cell: ti.i32, votes: ti.i32):
     """Add votes to a cell, within what it can hold."""
     total = ti.cast(evidence[s, cell], ti.i32) + votes
     evidence[s, cell] = ti.cast(ti.math.clamp(total, -MOST_VOTES, MOST_VOTES), ti.i8)
+
+
+@ti.func
+def surface_vote(behind: ti.f32, p: ti.template(), normal: ti.template(), fx: ti.f32, voxel_size: ti.f32):
+    """1 where a reading `behind` [m] a point p of the surface [m, camera] saw it, -1 where it passed through, else 0."""
+    cosine = ti.max(ti.abs(normal.dot(p)) / p.norm(), 0.02)
+    pixel = p[2] / fx * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine  # depth across one pixel
+    slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2] + pixel
+    vote = 0
+    if behind > slack:
+        vote = -1 if cosine > GRAZING else 0
+    elif behind > -slack:
+        vote = 1
+    return vote
 
 
 @ti.kernel
@@ -77,35 +84,31 @@ def vote_cells(
     # out:
     evidence: Votes2,       # (S, 64) += 1 where the frame saw the cell's surface, -= 1 where it saw through the cell
 ):
-    for s, half in ti.ndrange(voxels, 2):
-        ijk = row3(keys, s)
-        center = to_camera((ijk + 0.5) * voxel_size, T_camera_world)
-        z, reach = ti.max(center[2], 1e-3), 0.9 * voxel_size  # half the diagonal
-        u, v, around = center[0] / z * fx + cx, center[1] / z * fy + cy, 2.0 * reach * ti.max(fx, fy) / z
-        if center[2] > -reach and u > -around and v > -around and u < depth.shape[1] + around and v < depth.shape[0] + around:
-            supported = masks[s, half]
-            for k in range(32):
-                cell = half * 32 + k
-                x, vote = cell_center(cell), 0
-                if (supported >> ti.cast(31 - k, ti.u32)) & 1 == 0:  # nothing seen here yet, but later frames may invent some
-                    p = to_camera((ijk + x) * voxel_size, T_camera_world)
+    for s in range(voxels):
+        R = ti.Matrix([[T_camera_world[i, j] * voxel_size for j in range(3)] for i in range(3)])  # world [voxels] -> camera [m]
+        corner = R @ row3(keys, s) + ti.Vector([T_camera_world[i, 3] for i in ti.static(range(3))])
+        center = corner + R @ ti.Vector([0.5, 0.5, 0.5])
+        z, around = ti.max(center[2], 1e-3), 1.5 * voxel_size * ti.max(fx, fy) / ti.max(center[2] - voxel_size, 1e-3)
+        u, v = center[0] / z * fx + cx, center[1] / z * fy + cy  # what votes lies within a voxel's edge of its centre
+        if center[2] > -voxel_size and u > -around and v > -around and u < depth.shape[1] + around and v < depth.shape[0] + around:
+            F = ti.Vector([0.0] * rank)
+            for a in range(rank):
+                F[a] = latents[s, a, 0]
+            for cell in range(BLOCK_CELLS):
+                supported = (masks[s, cell >> 5] >> ti.cast(31 - (cell & 31), ti.u32)) & 1
+                vote = 0
+                if supported == 0:  # nothing seen here yet, but later frames may invent some
+                    p = corner + R @ cell_center(cell)
                     behind, known = read_behind(p, depth, fx, fy, cx, cy)
                     if known and behind > SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]:
                         vote = -1
                 else:
-                    x, normal, found = cell_surface(rank, s, cell, latents, features)
-                    p = to_camera((ijk + x) * voxel_size, T_camera_world)
-                    behind, known = read_behind(p, depth, fx, fy, cx, cy)
-                    if found and known:
-                        along = ti.Vector([T_camera_world[i, 0] * normal[0] + T_camera_world[i, 1] * normal[1]
-                                           + T_camera_world[i, 2] * normal[2] for i in ti.static(range(3))])
-                        cosine = ti.max(ti.abs(along.dot(p)) / p.norm(), 0.02)
-                        pixel = p[2] / fx * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine  # depth across one pixel
-                        slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2] + pixel
-                        if behind > slack:
-                            vote = -1 if cosine > GRAZING else 0
-                        elif behind > -slack:
-                            vote = 1
+                    x, normal, found = cell_surface(rank, F, cell, features)
+                    if found:
+                        p = corner + R @ x
+                        behind, known = read_behind(p, depth, fx, fy, cx, cy)
+                        if known:
+                            vote = surface_vote(behind, p, R @ normal / voxel_size, fx, voxel_size)
                 if vote != 0:
                     add_votes(evidence, s, cell, sign * vote)
 

@@ -87,8 +87,9 @@ class BaseMap(ABC):
         cloud = _finite_rows(cloud, self._observed(cloud))
         if len(cloud) == 0:
             return Integration(0, 0, len(self))
+        blocks = self._encode(cloud)  # before anything changes: it refuses clouds
         self._vote(cloud, -1)
-        encoded = self._regressor.take_out(self._encode(cloud))
+        encoded = self._regressor.take_out(blocks)
         return Integration(len(cloud), encoded, len(self))
 
     def _encode(self, cloud: PointCloud) -> FrameBlocks:
@@ -182,7 +183,8 @@ class BaseMap(ABC):
                 raise MapCorrupt(f"{path}: tensor '{name}' should be {shape} {np.dtype(dtype)}, found {found}; "
                                  "write the map again")
         if n and not (data.keys.min() >= -voxels.INDEX_HALF and data.keys.max() < voxels.INDEX_HALF
-                      and np.isfinite(data.weights).all() and (data.weights > 0).all() and np.isfinite(data.latents).all()):
+                      and np.isfinite(data.weights).all() and (data.weights > 0).all() and np.isfinite(data.latents).all()
+                      and (data.sums is None or np.isfinite(data.sums).all())):
             raise MapCorrupt(f"{path}: holds voxels out of range or numbers that are not finite; write the map again")
         if len(np.unique(data.keys, axis=0)) != max(n, 0):
             raise MapCorrupt(f"{path}: holds a voxel twice; write the map again")

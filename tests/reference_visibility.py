@@ -1,0 +1,83 @@
+"""Slow float64 twins of the votes of frames: evidence for the surface in every cell, and against it.
+
+A map is a dict from voxel index to `reference.Voxel`, evidence one from voxel index to (64,) votes.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from reference import CELLS, CORNERS, cell_number
+
+CENTERS = (np.array(list(product(range(CELLS), repeat=3))) + 0.5) / CELLS  # (64, 3) of cells, voxels from the voxel's corner
+
+
+def read_behind(p, depth, camera):
+    """How far behind p [m, camera] the reading of its pixel lies, None where there is no reading."""
+    if p[2] <= 0:
+        return None
+    u, v = (int(np.floor(x + 0.5)) for x in (camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy))
+    if not (0 <= u < camera.width and 0 <= v < camera.height) or depth[v, u] <= 0:
+        return None
+    return float(depth[v, u]) - p[2]
+
+
+def vote_of_free_cell(p, voxel_size, depth, camera):
+    """-1 where a ray passes a cell in which nothing was seen."""
+    behind = read_behind(p, depth, camera)
+    return -1 if behind is not None and behind > 0.5 * voxel_size + 0.004 * p[2]**2 else 0
+
+
+def vote_of_surface(p, normal, voxel_size, depth, camera):
+    """1 where the reading lies on a point of the surface [m, camera], -1 where it lies behind, and not at a grazing angle."""
+    behind = read_behind(p, depth, camera)
+    if behind is None:
+        return 0
+    cosine = max(abs(normal @ p) / np.linalg.norm(p), 0.02)
+    slack = 0.5 * voxel_size + 0.004 * p[2]**2 + p[2] / camera.fx * np.tan(np.arccos(cosine))
+    if behind > slack:
+        return -1 if cosine > 0.1 else 0
+    return 1 if behind > -slack else 0
+
+
+def vote_cells(encoder, voxels, voxel_size, depth, camera, T_camera_world):
+    """Voxel -> (64,) votes of one frame."""
+    t = (CENTERS - 0.5) / 2
+    f, slopes = encoder(t), 0.5 * encoder.gradient(t)  # t moves by half a voxel a voxel
+    R, origin = T_camera_world[:3, :3], T_camera_world[:3, 3]
+    votes = {}
+    for key, voxel in voxels.items():
+        votes[key] = np.zeros(CELLS**3, int)
+        for cell, center in enumerate(CENTERS):
+            if not voxel.mask[cell]:
+                p = R @ ((key + center) * voxel_size) + origin
+                votes[key][cell] = vote_of_free_cell(p, voxel_size, depth, camera)
+                continue
+            slope = slopes[cell] @ voxel.F[:, 0]
+            steep = np.linalg.norm(slope)
+            distance = f[cell] @ voxel.F[:, 0] / max(steep, 1e-6)
+            if steep > 0.2 and abs(distance) < 0.35:
+                normal = slope / steep
+                p = R @ ((key + center - distance * normal) * voxel_size) + origin
+                votes[key][cell] = vote_of_surface(p, R @ normal, voxel_size, depth, camera)
+    return votes
+
+
+def add_evidence(evidence, more):
+    """Sums of votes, as far as a cell can hold them."""
+    return np.clip(evidence.astype(int) + more, -127, 127)
+
+
+def interpolate_evidence(evidence, masks, x):
+    """(N,) tent-weighted mean over the eight nearest cells that have support, 0 where none has; x [voxels]."""
+    values = np.zeros(len(x))
+    for n, point in enumerate(x * CELLS - 0.5):
+        corner, total, weight = np.floor(point).astype(int), 0.0, 0.0
+        for at in corner + CORNERS:
+            key, cell = tuple((at // CELLS).tolist()), cell_number(at)
+            if key in evidence and masks[key][cell]:
+                tent = np.prod(1 - np.abs(point - at))
+                total, weight = total + tent * evidence[key][cell], weight + tent
+        values[n] = total / weight if weight > 1e-3 else 0.0
+    return values
