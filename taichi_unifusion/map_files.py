@@ -31,7 +31,8 @@ MAX_ELEMENTS = 1 << 48  # of one tensor, empty dimensions counted as 1: no produ
 Layout = dict[str, tuple[np.dtype, tuple[int, ...]]]  # tensor -> type and shape, in the order of their bytes
 
 _MANIFEST, _CHECKSUM = "taichi_unifusion", "taichi_unifusion_sha256"  # keys in the header's __metadata__
-_DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U64": "<u8", "U32": "<u4", "U8": "|u1", "I8": "|i1"}
+_DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U64": "<u8", "U32": "<u4", "U8": "|u1",
+           "I8": "|i1"}
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _FOREIGN = {  # how other files begin, for the message
     b"\x80": "a pickle, which can run code when it is read",

@@ -32,8 +32,8 @@ def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float,
                  min_evidence: float) -> Mesh:
     """Zero level of the blended field on `resolution`^3 cells a voxel, only where cells are supported.
 
-    A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map holds evidence, the mesh ends
-    on the line where evidence falls below `min_evidence`.
+    A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map holds evidence, the mesh
+    ends on the line where evidence falls below `min_evidence`.
     """
     keys, support = _cubes(grid, support_closing)
     if not len(keys):

@@ -169,7 +169,8 @@ def test_a_removed_frame_leaves_the_map_without_it(new):
     before, total = len(target), target.integrate(b).voxels
     target.remove(b)
     done = target.remove(b)
-    assert (done.points, done.voxels, done.total_voxels) == (len(b), total, len(without)) and before > len(without) == len(target)
+    assert (done.points, done.voxels, done.total_voxels) == (len(b), total, len(without))
+    assert before > len(without) == len(target)
     assert_close(target, without, rest_of(target), masks=False)
     ours, theirs = target._grid.export(), without._grid.export()
     assert ((ours.masks & theirs.masks) == theirs.masks).all()
@@ -239,7 +240,8 @@ def test_a_loaded_map_goes_on_as_the_saved_one(new, tmp_path):
     target = integrated(new(), (a, b))
     target.save(tmp_path / "map")
     loaded = load_map(tmp_path / "map")
-    assert [x.tobytes() for x in _arrays(loaded)] == [x.tobytes() for x in _arrays(target)] and answers(loaded) == answers(target)
+    assert [x.tobytes() for x in _arrays(loaded)] == [x.tobytes() for x in _arrays(target)]
+    assert answers(loaded) == answers(target)
     for grown in (target, loaded):
         grown.integrate(c)
         grown.remove(b)

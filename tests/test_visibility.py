@@ -80,10 +80,12 @@ def vote(voxels: dict, depth: np.ndarray, T: np.ndarray, sign: int, evidence: np
     keys = np.array(list(voxels), np.int32)
     kernels.vote_cells(ENCODER.rank, len(keys), keys, pack_masks(np.array([v.mask for v in voxels.values()])),
                        np.array([v.F for v in voxels.values()], np.float32), target._regressor.cell_gradients.to_numpy(), VS,
-                       depth, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, np.ascontiguousarray(T[:3], np.float32), sign, evidence)
+                       depth, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, np.ascontiguousarray(T[:3], np.float32), sign,
+                       evidence)
 
 
-@pytest.mark.parametrize("T", [pose((0.003, 0.0017, -0.0021)), pose((0.1, -0.05, 0.02), 0.4, -0.3, 1.0)], ids=["straight", "turned"])
+@pytest.mark.parametrize("T", [pose((0.003, 0.0017, -0.0021)), pose((0.1, -0.05, 0.02), 0.4, -0.3, 1.0)],
+                         ids=["straight", "turned"])
 def test_vote_cells_equals_its_twin(voxels, depth, T):
     """Before and behind the camera, inside and outside the image; the same frame with sign -1 takes its votes out.
 
@@ -166,7 +168,8 @@ def plane_before_wall(T_scene_camera: np.ndarray, edge: float, far: float = 2.0)
     return Frame(np.where(origin[0] + depth * ray[..., 0] < edge, depth, wall).astype(np.float32), CAMERA)
 
 
-POSES = [pose((0.15 * np.cos(k * np.pi / 4) * (1 + 0.1 * k), 0.1 * np.sin(k * np.pi / 4), 0), 0.1 * np.sin(k), 0.05 * np.cos(2 * k))
+POSES = [pose((0.15 * np.cos(k * np.pi / 4) * (1 + 0.1 * k), 0.1 * np.sin(k * np.pi / 4), 0), 0.1 * np.sin(k),
+              0.05 * np.cos(2 * k))
          for k in range(12)]
 T_WORLD_SCENE = pose((0.3, -0.2, 0), 0.4, 0.3, 0.5)  # so that nothing lies along the voxels
 
@@ -311,7 +314,8 @@ def test_without_carve_there_is_no_evidence(tmp_path):
     assert load_map(tmp_path / "map")._grid.export().evidence is None
 
 
-@pytest.mark.parametrize("damage", [lambda e: None, lambda e: e[:, :63].copy(), lambda e: e[:-1].copy(), lambda e: e.astype(np.int32)],
+@pytest.mark.parametrize("damage", [lambda e: None, lambda e: e[:, :63].copy(), lambda e: e[:-1].copy(),
+                                    lambda e: e.astype(np.int32)],
                          ids=["missing", "cells", "rows", "type"])
 def test_damaged_evidence_is_refused(carved, tmp_path, damage):
     carved.save(tmp_path / "map")

@@ -90,7 +90,8 @@ def vote_cells(
         center = corner + R @ ti.Vector([0.5, 0.5, 0.5])
         z, around = ti.max(center[2], 1e-3), 1.5 * voxel_size * ti.max(fx, fy) / ti.max(center[2] - voxel_size, 1e-3)
         u, v = center[0] / z * fx + cx, center[1] / z * fy + cy  # what votes lies within a voxel's edge of its centre
-        if center[2] > -voxel_size and u > -around and v > -around and u < depth.shape[1] + around and v < depth.shape[0] + around:
+        in_image = u > -around and v > -around and u < depth.shape[1] + around and v < depth.shape[0] + around
+        if center[2] > -voxel_size and in_image:
             F = ti.Vector([0.0] * rank)
             for a in range(rank):
                 F[a] = latents[s, a, 0]

@@ -89,9 +89,9 @@ class Regressor:
         """Encode from the blocks' compacted cells."""
         self._begin(blocks)
         kernels.encode_cells(self.rank, self.size, self.rows, self.channels, self.centered, self.derivatives,
-                             not self.information, blocks.count, self.neighbors, blocks.masks, self.window, blocks.totals, blocks.starts,
-                             blocks.cells, self.cell_features, self.min_points, self.noise, self.workers, self.stride,
-                             self.tiles, self.latents, self.weights, self.sums)
+                             not self.information, blocks.count, self.neighbors, blocks.masks, self.window, blocks.totals,
+                             blocks.starts, blocks.cells, self.cell_features, self.min_points, self.noise, self.workers,
+                             self.stride, self.tiles, self.latents, self.weights, self.sums)
 
     def encode_points(self, blocks: FrameBlocks, starts: NDArray[np.int32], samples: NDArray[np.float32],
                       targets: NDArray[np.float32]) -> None:
