@@ -24,9 +24,9 @@ class PreprocessSettings:
     """Farthest reading that is used, in metres."""
     edge_jump: float = 0.03
     """Neighbouring pixels whose depths differ by more than this share of the depth lie on different surfaces."""
-    edge_support: int = 5
+    edge_support: int = 1
     """How many of a pixel's 8 neighbours must lie on its surface; fewer: a flying pixel. 0 keeps all."""
-    normal_radius: int = 3
+    normal_radius: int = 2
     """Radius in pixels of the window from which a normal is estimated."""
     max_angle: float = 80.0
     """Pixels seen at a more grazing angle than this, in degrees between ray and normal, are left out."""

@@ -23,19 +23,28 @@ def read_behind(p, depth, camera):
     return float(depth[v, u]) - p[2]
 
 
+def seen_beside(p, slack, depth, camera):
+    """Whether any of the 3x3 pixels around that of p reads its depth; never on the border of the image."""
+    u, v = (int(np.floor(x + 0.5)) for x in (camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy))
+    if not (1 <= u < camera.width - 1 and 1 <= v < camera.height - 1):
+        return False
+    readings = depth[v - 1:v + 2, u - 1:u + 2]
+    return bool(((readings > 0) & (np.abs(readings - p[2]) < slack)).any())
+
+
 def vote_of_free_cell(p, voxel_size, depth, camera):
     """-1 where a ray passes a cell in which nothing was seen."""
     behind = read_behind(p, depth, camera)
-    return -1 if behind is not None and behind > 0.5 * voxel_size + 0.004 * p[2]**2 else 0
+    return -1 if behind is not None and behind > 0.5 * voxel_size + 0.003 * p[2]**2 else 0
 
 
 def vote_of_surface(p, normal, voxel_size, depth, camera):
     """1 where the reading lies on a point of the surface [m, camera], -1 where it lies behind, and not at a grazing angle."""
     behind = read_behind(p, depth, camera)
-    if behind is None:
-        return 0
     cosine = max(abs(normal @ p) / np.linalg.norm(p), 0.02)
-    slack = 0.5 * voxel_size + 0.004 * p[2]**2 + p[2] / camera.fx * np.tan(np.arccos(cosine))
+    slack = 0.5 * voxel_size + 0.003 * p[2]**2 + p[2] / camera.fx * np.tan(np.arccos(cosine))
+    if behind is None:
+        return int(p[2] > 0 and seen_beside(p, slack, depth, camera))
     if behind > slack:
         return -1 if cosine > 0.1 else 0
     return 1 if behind > -slack else 0

@@ -13,7 +13,7 @@ Votes2 = ti.types.ndarray(dtype=ti.i8, ndim=2)
 
 MOST_VOTES = 127       # votes that a cell can hold, for or against
 SLACK_VOXELS = 0.5     # a reading this far behind a point passes through it [voxels]...
-SLACK_NOISE = 0.004    # ...plus this much [1/m] times its depth squared: three sigma of a Kinect
+SLACK_NOISE = 0.003    # ...plus this much [1/m] times its depth squared: two sigma of a Kinect
 GRAZING = 0.1          # cosine; rays flatter on a surface than this cannot say that they pass through it
 ALONE = 0.35           # the surface of a cell lies within this distance of its centre [voxels]
 FLAT = 0.2             # a field with a smaller slope than this has no surface to speak of
@@ -54,13 +54,30 @@ def add_votes(evidence: ti.template(), s: ti.i32, cell: ti.i32, votes: ti.i32):
 
 
 @ti.func
-def surface_vote(behind: ti.f32, p: ti.template(), normal: ti.template(), fx: ti.f32, voxel_size: ti.f32):
-    """1 where a reading `behind` [m] a point p of the surface [m, camera] saw it, -1 where it passed through, else 0."""
+def seen_beside(p: ti.template(), slack: ti.f32, depth: ti.template(), fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32):
+    """Whether a pixel beside that of p [m, camera] reads its depth: on glass and dark things, readings come and go."""
+    seen = False
+    u, v = p[0] / p[2] * fx + cx + 0.5, p[1] / p[2] * fy + cy + 0.5
+    if u >= 1 and v >= 1 and u < depth.shape[1] - 1 and v < depth.shape[0] - 1:
+        for o in range(9):
+            reading = depth[ti.cast(v, ti.i32) + o // 3 - 1, ti.cast(u, ti.i32) + o % 3 - 1]
+            seen = seen or (reading > 0 and ti.abs(reading - p[2]) < slack)
+    return seen
+
+
+@ti.func
+def surface_vote(p: ti.template(), normal: ti.template(), voxel_size: ti.f32, depth: ti.template(),
+                 fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32):
+    """1 where a reading saw a point p of the surface [m, camera], -1 where it passed through, else 0."""
+    behind, known = read_behind(p, depth, fx, fy, cx, cy)
     cosine = ti.max(ti.abs(normal.dot(p)) / p.norm(), 0.02)
     pixel = p[2] / fx * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine  # depth across one pixel
     slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2] + pixel
     vote = 0
-    if behind > slack:
+    if not known:
+        if p[2] > 0:
+            vote = ti.cast(seen_beside(p, slack, depth, fx, fy, cx, cy), ti.i32)
+    elif behind > slack:
         vote = -1 if cosine > GRAZING else 0
     elif behind > -slack:
         vote = 1
@@ -106,10 +123,7 @@ def vote_cells(
                 else:
                     x, normal, found = cell_surface(rank, F, cell, features)
                     if found:
-                        p = corner + R @ x
-                        behind, known = read_behind(p, depth, fx, fy, cx, cy)
-                        if known:
-                            vote = surface_vote(behind, p, R @ normal / voxel_size, fx, voxel_size)
+                        vote = surface_vote(corner + R @ x, R @ normal / voxel_size, voxel_size, depth, fx, fy, cx, cy)
                 if vote != 0:
                     add_votes(evidence, s, cell, sign * vote)
 

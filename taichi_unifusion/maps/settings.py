@@ -49,19 +49,19 @@ class SurfaceSettings(MapSettings):
 
     gpis: Literal["samples", "derivatives"] = "samples"
     """samples: points on and beside the surface carry signed distances; derivatives: points carry their normals (Eq. 14-17)."""
-    sample_distance: float = 0.15
+    sample_distance: float = 0.3
     """Distance of the off-surface samples along the normal, in voxels (d_s)."""
     support_points: int = 4
     """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one frame (fewer where a whole
     voxel has few); 0: everywhere in voxels that held any."""
 
-    support_closing: int = 14
+    support_closing: int = 20
     """Cells with at least this many of their 26 neighbours seen count as seen, which closes pinholes; 27: none, 1: a rim all
     around."""
     carve: bool = True
     """Cut the mesh where more frames saw through the surface than saw it."""
-    min_evidence: float = 0.0
-    """With `carve`: keep surface that at least this many more frames saw than saw through."""
+    min_evidence: float = 0.9
+    """With `carve`: keep surface that at least this many more frames saw than saw through; 1.5 asks for two frames."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
