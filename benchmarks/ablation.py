@@ -111,7 +111,10 @@ def voxel_size(scene: Scene, out: Path) -> None:
 
 def kernel(scene: Scene | None, out: Path) -> None:
     """Fig. 13: mean |K - K^| of 2000 random points against eigenpairs l and anchors."""
-    from matplotlib.figure import Figure
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise SystemExit("ablation: the plot needs matplotlib: pip install matplotlib") from None
 
     figure = Figure(figsize=(8, 3), layout="constrained")
     rank, anchors = KEPT

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from quality_scenes import DEPTH_RANGE
 
 from taichi_unifusion import Config, Pipeline, load_config
-from taichi_unifusion.errors import InputError
+from taichi_unifusion.errors import InputError, MissingDependency
 from taichi_unifusion.types import Frame, Mesh
 
 PAPER = Path(__file__).resolve().parents[1] / "configs" / "paper.yaml"
@@ -76,8 +76,11 @@ def ours(config: Config, frames: Sequence[Frame]) -> Reconstruction:
 def tsdf(frames: Sequence[Frame], voxel_size: float, truncation: float = TRUNCATION,
          min_weight: float = MIN_WEIGHT) -> Reconstruction:
     """Open3D's VoxelBlockGrid on the raw depth, float32."""
-    import open3d as o3d
-    from open3d.core import Device, Tensor, float32
+    try:
+        import open3d as o3d
+        from open3d.core import Device, Tensor, float32
+    except ImportError:
+        raise MissingDependency("the TSDF needs Open3D: pip install 'taichi-unifusion[open3d]'") from None
 
     cpu, far = Device("CPU:0"), DEPTH_RANGE[1]
     grid = o3d.t.geometry.VoxelBlockGrid(tuple(TSDF_BYTES), (float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, 8_000, cpu)
