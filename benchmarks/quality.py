@@ -35,6 +35,7 @@ COLUMNS = {  # title -> (where in a row's numbers, format)
     "Accuracy %": ("precision_2.5cm", ".1%"), "Completeness %": ("recall_2.5cm", ".1%"), "F1 2.5 cm": ("f1_2.5cm", ".1%"),
     "F1 1 cm": ("f1_1cm", ".1%"), "Depth L1 cm": ("depth_l1_cm", ".2f"), "median cm": ("depth_median_cm", ".2f"),
     "coverage": ("coverage", ".3f"), "PSNR dB": ("psnr_db", ".2f"), "SSIM": ("ssim", ".3f"), "map MB": ("map_mb", ".1f"),
+    "of it surface": ("surface_mb", ".1f"),
     "lean MB": ("lean_mb", ".1f"), "ms a frame": ("cpu_ms", ".0f"),
 }
 
