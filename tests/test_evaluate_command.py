@@ -194,12 +194,22 @@ def test_rendering_takes_held_out_frames_half_way_between_the_used_ones(results,
     (["--start", "2"], [2, 4, 5], []),
     (["--end", "4"], [1, 2], []),
     (["--every", "2", "--all"], [0, 2, 4, 6], [0, 6]),
+    (["--every", "2"], [2, 4], []),
+    (["--all"], [0, 3, 6], [0, 3, 6]),
     (["--start", "3", "--end", "5", "--all"], [3, 4], [3]),
     (["--all", "--end", "1"], [0], [0]),
 ])
 def test_rendering_takes_the_frames_that_are_asked_for(results, evaluate, flags, frames, used):
     found = evaluate("rendering", results, *flags)
     assert [frame["index"] for frame in found["frames"]] == frames and found["used_by_the_run"] == used
+
+
+def test_rendering_stays_between_the_runs_first_and_last_frame(results, recording, evaluate, tmp_path):
+    longer = write_folder(tmp_path / "longer", [*make_frames(FRAMES), *make_frames(6)])
+    for flags, frames in (([], [1, 4, 7]), (["--every", "2"], [2, 4, 8]), (["--start", "7", "--end", "11"], [7, 8, 9, 10]),
+                          (["--start", "11"], [11, 12])):
+        found = evaluate("rendering", results, "folder", longer, *flags)
+        assert [frame["index"] for frame in found["frames"]] == frames
 
 
 def test_rendering_of_a_mesh_file(results, recording, evaluate):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-RUN_DEFAULT, CHOICE_DEFAULT = "(default: the run's recording)", "(default: see above)"
+RUN_DEFAULT, CHOICE_DEFAULT = "(default: the run's recording)", "(default: the run's)"
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class EvaluateRendering(ScoreOptions):
 
     Example: unifusion evaluate rendering results/kitchen
 
-    Of a results folder, with frames that its run did not use: those half-way between the ones that it did, unless --start,
-    --end or --every choose others. Colour is decoded from its colour map at the points that the rays hit.
+    Of a results folder, with frames that its run did not use: those half-way between the ones that it did. --start, --end and
+    --every choose others between its first and its last, or beyond. Colour is decoded from its colour map at the points hit.
     """
 
     reconstruction: Annotated[Positional[Path], arg(metavar="RESULTS|MESH")]
@@ -47,10 +47,10 @@ class EvaluateRendering(ScoreOptions):
     """First frame, counted from 0."""
     end: Annotated[int | None, arg(metavar="B", help_behavior_hint=CHOICE_DEFAULT)] = None
     """Frame to stop before."""
-    every: Annotated[int | None, arg(metavar="N", help_behavior_hint=CHOICE_DEFAULT)] = None
+    every: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 1, or see above)")] = None
     """Compare with every N-th frame."""
     all: FlagCreatePairsOff[bool] = False
-    """Take frames that the run has used, too."""
+    """Let frames in that the run has used; alone: these."""
     depth_min: Annotated[float | None, arg(metavar="M", help_behavior_hint="(default: the run's, else 0.1)")] = None
     """Nearest reading to compare with, in metres."""
     depth_max: Annotated[float | None, arg(metavar="M", help_behavior_hint="(default: the run's, else 5)")] = None
@@ -115,17 +115,17 @@ def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Ru
 
 def choose_frames(options: EvaluateRendering, run: Run | None, count: int, name: str) -> Sequence[int]:
     """The frames to compare with, of `count` in the recording: held-out ones, unless `options.all`."""
-    chosen = (options.start, options.end, options.every) != (None, None, None)
-    if run is None or chosen or options.all:
-        start, every = options.start or 0, 1 if options.every is None else options.every
-        if start < 0 or every < 1 or (options.end is not None and options.end <= start):
-            raise InputError(f"frames: need 0 <= start < end and every >= 1, got start {start}, end {options.end}, "
-                             f"every {every}")
-        asked = range(count)[start:options.end:every]
-        if not asked:
-            raise DatasetError(f"{name}: there is no frame {start}, it has {count} (0 is the first)")
-    else:
-        asked = range(run.start + run.every // 2, min(run.stop, count), run.every)
+    start, end, every = options.start, options.end, options.every
+    if run is not None and (start, end, every) == (None, None, None):
+        start, every = run.start + (0 if options.all else run.every // 2), run.every
+    start = (run.start if run else 0) if start is None else start
+    end = run.stop if end is None and run and start < run.stop else end
+    every = 1 if every is None else every
+    if start < 0 or every < 1 or (end is not None and end <= start):
+        raise InputError(f"frames: need 0 <= start < end and every >= 1, got start {start}, end {end}, every {every}")
+    asked = range(count)[start:end:every]
+    if not asked:
+        raise DatasetError(f"{name}: there is no frame {start}, it has {count} (0 is the first)")
     held_out = asked if run is None or options.all else [i for i in asked if i not in set(run.used)]
     if not held_out:
         raise InputError("rendering: the run has used every one of these frames; reconstruct with --every 2 or more to hold "
