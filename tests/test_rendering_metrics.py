@@ -103,6 +103,9 @@ def test_what_is_not_hit_lowers_coverage_alone():
     assert (result.coverage, result.depth_within, result.frames[0].readings) == (0.5, 0.5, 64 * 48)
     assert result.depth_l1_cm == pytest.approx(1, abs=ROUNDING)
     assert result.psnr_db > 60 and result.ssim == pytest.approx(1, abs=1e-3)
+    depth = np.full(SHAPE, 2.0)
+    depth[:, :16] = 0  # of the readings left, two thirds are not hit
+    assert evaluate_rendering(half, [frame_of(depth)]).coverage == pytest.approx(1 / 3)
 
 
 def test_F2_only_readings_in_range_are_compared():

@@ -109,6 +109,30 @@ def test_rpe_is_the_error_of_each_motion():
     assert evaluate_trajectory(estimate, truth, rpe_delta=0.25, rpe_unit="metres").rpe_rotation_deg.max == pytest.approx(6)
 
 
+def test_a_delta_in_metres_is_not_lost_to_rounding():
+    """Ten centimetres a step, one degree too far at each: three steps are 0.3 m, wherever on the path they begin."""
+    truth, T, poses = line(80), np.eye(4), []
+    for _ in range(80):
+        poses.append(T)
+        T = T @ shift(0.1) @ turn(2, 1)
+    found = evaluate_trajectory(Trajectory(truth.timestamps, np.stack(poses)), truth, rpe_delta=0.3, rpe_unit="metres")
+    assert found.rpe_rotation_deg.max == pytest.approx(3)
+
+
+def test_a_path_in_a_plane_leaves_no_rotation_open():
+    poses = curve().T_world_camera.copy()
+    poses[:, 2, 3] = 0
+    flat = Trajectory(curve().timestamps, poses)
+    assert evaluate_trajectory(flat, flat).unique
+
+
+def test_the_order_of_the_poses_does_not_matter():
+    truth, estimate = curve(), noisy(curve())
+    mixed = [Trajectory(t.timestamps[order], t.T_world_camera[order]) for t, order in
+             ((estimate, np.random.default_rng(1).permutation(40)), (truth, np.random.default_rng(2).permutation(40)))]
+    assert evaluate_trajectory(*mixed) == evaluate_trajectory(estimate, truth)
+
+
 def test_a_delta_longer_than_the_path_leaves_rpe_out():
     for options in ({"rpe_delta": 40}, {"rpe_delta": 50.0, "rpe_unit": "metres"}):
         result = evaluate_trajectory(curve(), curve(), **options)
