@@ -18,6 +18,7 @@ FORMATS = {  # name -> module here, what opens a recording
     "replica": ("replica", "open_replica"),
     "tum": ("tum", "open_tum"),
     "scannet": ("scannet", "open_scannet"),
+    "k4a": ("k4a", "open_k4a"),
     "folder": ("folder", "open_folder"),
     "scene": ("scene", "open_scene"),
 }

@@ -2,7 +2,8 @@
 
 Depth: `depth/NAME.png`, 16 bits, `depth_scale` units a metre (default 1000), 0 and 65535 no reading; or `depth/NAME.npy`,
 floats in metres. Colour: `color/NAME.png` or `.jpg`, registered to depth; another size of the same shape is resampled. Frames
-are the names, in the order of the numbers in them. Poses: camera-to-world in metres, camera x right, y down, z forward, as
+are the names, in the order of the numbers in them. Infrared, if any: `infrared/NAME.png`, one channel of 8 or 16 bits,
+registered to depth, for the frames that have one. Poses: camera-to-world in metres, camera x right, y down, z forward, as
 `poses/NAME.txt` (4x4 each), or `poses.txt` with rows `NAME tx ty tz qx qy qz qw` (a name that is a number may be a time stamp,
 matched within max_difference), or `poses.txt` with one row of 16 numbers for every frame, in their order.
 """
@@ -25,7 +26,7 @@ from .listing import list_names
 from .poses import Pose, TumRow, finite_or_none, matrix_from_row, read_lines, read_matrix_file, split_row, tum_row
 from .recording import FrameFiles, Recording, depth_size
 
-DEPTH_SUFFIXES, COLOR_SUFFIXES = (".png", ".npy"), (".png", ".jpg", ".jpeg")
+DEPTH_SUFFIXES, COLOR_SUFFIXES, INFRARED_SUFFIXES = (".png", ".npy"), (".png", ".jpg", ".jpeg"), (".png",)
 MAX_DIFFERENCE = 0.02  # [s]
 CAMERA_FILE = "camera.yaml"
 
@@ -36,12 +37,13 @@ def open_folder(path: Path, *, depth_scale: float | None = None, camera: Pinhole
     check_max_difference(max_difference)
     settings = _settings(path, camera)
     depth, color = _images(path / "depth", DEPTH_SUFFIXES), _images(path / "color", COLOR_SUFFIXES)
+    infrared = _images(path / "infrared", INFRARED_SUFFIXES)
     if not depth:
         raise DatasetError(f"{path / 'depth'}: no *.png (16 bits) or *.npy (metres) here")
     stems = in_order({*depth, *color})
     poses = _read_poses(_pose_source(path, settings), stems, max_difference)
     frames = [FrameFiles(_file_of(stem, depth), _file_of(stem, color) if color else None, pose,
-                         finite_or_none(stem) if "." in stem else None)
+                         finite_or_none(stem) if "." in stem else None, infrared.get(stem))
               for stem, pose in zip(stems, poses, strict=True)]
     source = str(path / CAMERA_FILE) if camera is None else "camera"
     camera = check_size(camera or settings.camera(source), depth_size(frames), source)

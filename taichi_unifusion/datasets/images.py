@@ -68,6 +68,16 @@ def depth_to_metres(raw: NDArray, where: str, depth_scale: float, invalid: Colle
     return depth
 
 
+def read_infrared(path: Path) -> NDArray[np.float32]:
+    """The infrared image at `path`, one channel of 8 or 16 bits, as (H, W) float32 of 0..65535."""
+    image = _decode(_read_bytes(path), str(path))
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise FrameError(f"{path}: infrared must be one channel of 8 or 16 bits, got {channels} of {image.dtype}; convert it to "
+                         "grey values")
+    return image.astype(np.float32) * np.float32(257 if image.dtype == np.uint8 else 1)  # 255 * 257 = 65535
+
+
 def depth_file_size(path: Path) -> tuple[int, int]:
     """(width, height) of the depth image at `path`, from its header alone."""
     if path.suffix.lower() == ".npy":
@@ -81,13 +91,18 @@ def depth_file_size(path: Path) -> tuple[int, int]:
 
 def resize_color(color: NDArray[np.uint8], width: int, height: int, where: str) -> NDArray[np.uint8]:
     """Colour resampled to the depth image's size, or SizeMismatch where the shapes differ by more than 1 %."""
-    color_height, color_width = color.shape[:2]
-    if (color_width, color_height) == (width, height):
-        return color
-    if abs(color_width * height / (color_height * width) - 1) > SAME_ASPECT:
-        raise SizeMismatch(f"{where}: colour is {color_width}x{color_height} but depth is {width}x{height}, another shape; "
-                           "register colour to depth first")
-    return cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA if width < color_width else cv2.INTER_LINEAR)
+    return resize_image(color, width, height, where, "colour")
+
+
+def resize_image(image: NDArray, width: int, height: int, where: str, what: str = "the image") -> NDArray:
+    """An image (H, W[, c]) resampled to the depth image's size, or SizeMismatch where the shapes differ by more than 1 %."""
+    image_height, image_width = image.shape[:2]
+    if (image_width, image_height) == (width, height):
+        return image
+    if abs(image_width * height / (image_height * width) - 1) > SAME_ASPECT:
+        raise SizeMismatch(f"{where}: {what} is {image_width}x{image_height} but depth is {width}x{height}, another shape; "
+                           f"register {what} to depth first")
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if width < image_width else cv2.INTER_LINEAR)
 
 
 def _read_bytes(path: Path, count: int = -1) -> bytes:

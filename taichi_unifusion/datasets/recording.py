@@ -16,7 +16,7 @@ from ..errors import DatasetError, FrameError, InputError
 from ..types import Frame, PinholeCamera
 from .base import Dataset
 from .checks import camera_warnings, pose_warnings
-from .images import INVALID_DEPTH, depth_file_size, read_color, read_depth, resize_color
+from .images import INVALID_DEPTH, depth_file_size, read_color, read_depth, read_infrared, resize_color, resize_image
 from .poses import Pose
 
 SIZE_SAMPLES = 5  # depth headers read to learn the size, so that one odd file does not decide it
@@ -30,6 +30,7 @@ class FrameFiles:
     color: Path | None = None
     pose: Pose | None = None
     timestamp: float | None = None  # [s]
+    infrared: Path | None = None
 
 
 class Recording(Dataset):
@@ -60,7 +61,11 @@ class Recording(Dataset):
             color = read_color(files.color, drop_alpha=self.drop_alpha)
             if self.fit_color:
                 color = resize_color(color, depth.shape[1], depth.shape[0], str(files.color))
-        return Frame(depth, self.camera, color, T_world_camera, index, files.timestamp, str(files.depth))
+        frame = Frame(depth, self.camera, color, T_world_camera, index, files.timestamp, str(files.depth))
+        if files.infrared is None or not files.infrared.exists():  # a frame may lack it, as it may lack a reading
+            return frame
+        infrared = read_infrared(files.infrared)
+        return frame.with_image("infrared", resize_image(infrared, depth.shape[1], depth.shape[0], str(files.infrared)))
 
 
 def check_depth_scale(depth_scale: float, source: str) -> float:

@@ -1,6 +1,7 @@
 """ScanNet, as its tools leave it: an extracted folder, an older flat folder, or the `.sens` container itself.
 
-Extracted: `color/N.jpg`, `depth/N.png`, `pose/N.txt`, `intrinsic/intrinsic_depth.txt` (4x4). Flat: `frame-XXXXXX.color.jpg`,
+Extracted: `color/N.jpg`, `depth/N.png`, `pose/N.txt`, `intrinsic/intrinsic_depth.txt` (4x4), and `infrared/N.png` where a rig
+has it. Flat: `frame-XXXXXX.color.jpg`,
 `frame-XXXXXX.depth.pgm` (or .png), `frame-XXXXXX.pose.txt`, `_info.txt`. Container: see sens.py.
 Depth: 16 bits, millimetres, 0 no reading. Poses: 4x4 camera-to-world in metres, camera x right, y down, z forward; where
 tracking was lost they are -inf, and that frame is refused. Colour (1296x968) is registered to depth (640x480) and resampled.
@@ -48,8 +49,9 @@ def _open_extracted(path: Path, depth_scale: float | None, camera: PinholeCamera
     depth = numbered_files(path / "depth", r"(\d+)\.png")
     color = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
     pose = numbered_files(path / "pose", r"(\d+)\.txt")
+    infrared = numbered_files(path / "infrared", r"(\d+)\.png") if (path / "infrared").is_dir() else {}
     frames = [FrameFiles(file_of(number, depth, path / "depth", "{}.png"), file_of(number, color, path / "color", "{}.jpg"),
-                         read_matrix_file(file_of(number, pose, path / "pose", "{}.txt")))
+                         read_matrix_file(file_of(number, pose, path / "pose", "{}.txt")), infrared=infrared.get(number))
               for number in sorted({*depth, *color, *pose})]
     if not frames:
         raise DatasetError(f"{path}: no color/N.jpg, depth/N.png or pose/N.txt here")

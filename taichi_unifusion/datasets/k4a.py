@@ -1,0 +1,220 @@
+"""Recordings of an Azure Kinect, the `.mkv` that `k4arecorder` writes: depth, active infrared, colour and factory calibration.
+
+Depth and infrared are tracks of 16-bit big-endian images, depth in millimetres with 0 for no reading; colour is MJPEG, NV12 or
+YUY2; `calibration.json` is an attachment. Images are registered with the factory calibration, distortion included: to the
+depth camera (`align="depth"`, the default: depth keeps its pixels, colour is looked up), or to the colour camera
+(`align="color"`, as the paper does: depth and infrared are carried over). Either way a pixel has depth only where both cameras
+see its point. Infrared becomes the image "infrared", (H, W, 1), in units of 0..65535.
+
+Poses: `NAME.txt` beside `NAME.mkv`, rows `timestamp tx ty tz qx qy qz qw` with the recording's seconds, camera-to-world of the
+camera that is aligned to. Without such a file the first frame's camera is the world, and other frames have no pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DatasetError, FrameError, InputError, MissingDependency
+from ..types import Frame
+from .association import check_max_difference, nearest
+from .base import Dataset
+from .checks import pose_warnings
+from .images import decode_color, depth_to_metres
+from .k4a_calibration import read_calibration
+from .lens_camera import color_for_depth, splat_depth
+from .poses import Pose, read_tum_rows
+
+DEPTH_SCALE = 1000.0
+TRACKS = ("DEPTH", "COLOR", "IR")  # titles
+MAX_DIFFERENCE = 0.02              # [s] between a pose and a depth image
+CALIBRATION = "calibration.json"
+FINER = 1.5                        # readings a pixel of the colour camera that keep depth free of holes there
+
+
+def open_k4a(path: Path, *, align: Literal["depth", "color"] = "depth", depth_scale: float | None = None,
+             max_difference: float = MAX_DIFFERENCE) -> K4aFile:
+    """The recording in file `path`; poses further than `max_difference` [s] from a depth image do not belong to it."""
+    if align not in ("depth", "color"):
+        raise InputError(f"align: '{align}' is unknown, choose one of depth, color")
+    check_max_difference(max_difference)
+    return K4aFile(path, align, DEPTH_SCALE if depth_scale is None else depth_scale, max_difference)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Time stamps [us] of the images of one frame; None: the recording lacks that one."""
+
+    depth: int
+    color: int | None
+    infrared: int | None
+
+
+class K4aFile(Dataset):
+    """The frames of an Azure Kinect recording, each read when asked for."""
+
+    def __init__(self, path: Path, align: str, depth_scale: float, max_difference: float) -> None:
+        self.name, self.path, self.align, self.depth_scale = f"k4a {path}", path, align, depth_scale
+        with _opened(path) as container:
+            streams = _tracks(container, path)
+            self.sizes = {title: (stream.width, stream.height) for title, stream in streams.items()}
+            attached = next((s.data for s in container.streams.attachments if s.name == CALIBRATION), None)
+            if attached is None:
+                raise DatasetError(f"{path}: no {CALIBRATION} is attached; was the recording converted by another program?")
+            self.calibration = read_calibration(attached, f"{path}: {CALIBRATION}", self.sizes["DEPTH"], self.sizes.get("COLOR"))
+            stamps = {title: [] for title in streams}
+            for packet in container.demux(*streams.values()):
+                if packet.pts is not None:
+                    stamps[_title(packet.stream)].append(packet.pts)
+        self.captures = _captures({title: np.array(sorted(values)) for title, values in stamps.items()})
+        if not self.captures:
+            raise DatasetError(f"{path}: holds no depth image")
+        if align == "color" and self.calibration.color is None:
+            raise DatasetError(f"{path}: align 'color' needs a colour track, and this recording has none")
+        self.poses = _read_poses(path.with_suffix(".txt"), self.captures, max_difference)
+        self.warnings = tuple(pose_warnings(self.poses))
+
+    @property
+    def camera(self):
+        """The pinhole camera of the frames."""
+        return (self.calibration.color if self.align == "color" else self.calibration.depth).pinhole
+
+    def __len__(self) -> int:
+        return len(self.captures)
+
+    def load(self, index: int) -> Frame:
+        """Read and register frame `index`; FrameError (PoseError) names the file and the frame."""
+        capture, where = self.captures[index], f"{self.path} frame {index}"
+        pose = self.poses[index]
+        T_world_camera = None if pose.T_world_camera is None and not pose.problem else pose.checked()
+        images = self._read(capture, where)
+        raw = images["DEPTH"]
+        depth = depth_to_metres(raw, f"{where} depth", self.depth_scale, ())
+        infrared = images["IR"].astype(np.float32) if "IR" in images else np.zeros(raw.shape, np.float32)
+        register = self._to_color if self.align == "color" else self._to_depth
+        depth, color, infrared = register(depth, images.get("COLOR"), infrared)
+        frame = Frame(depth, self.camera, color, T_world_camera, index, capture.depth * 1e-6, where)
+        return frame.with_image("infrared", infrared) if "IR" in images else frame
+
+    def _to_depth(self, depth: NDArray, color: NDArray | None, infrared: NDArray) -> tuple[NDArray, NDArray | None, NDArray]:
+        cameras, camera = self.calibration, self.camera
+        depth = cameras.depth.undistort_depth(depth, camera)
+        infrared = cameras.depth.undistort(infrared, camera)
+        if color is not None:
+            color_camera = cameras.color.pinhole
+            color, seen = color_for_depth(cameras.color.undistort(color, color_camera), color_camera, depth, camera,
+                                          cameras.T_color_depth)
+            depth[~seen] = 0
+        return depth, color, infrared
+
+    def _to_color(self, depth: NDArray, color: NDArray | None, infrared: NDArray) -> tuple[NDArray, NDArray | None, NDArray]:
+        cameras, camera = self.calibration, self.camera
+        own = cameras.depth.pinhole
+        factor = int(np.ceil(FINER * max(camera.fx / own.fx, camera.fy / own.fy)))
+        finer = own.resized(own.width * factor, own.height * factor)
+        depth, infrared = splat_depth(cameras.depth.undistort_depth(depth, finer), cameras.depth.undistort(infrared, finer),
+                                      finer, camera, cameras.T_color_depth)
+        return depth, None if color is None else cameras.color.undistort(color, camera), infrared
+
+    def _read(self, capture: Capture, where: str) -> dict[str, NDArray]:
+        """The images of a frame by title of their track, as they are in the file."""
+        wanted = {"DEPTH": capture.depth, "COLOR": capture.color, "IR": capture.infrared}
+        wanted = {title: stamp for title, stamp in wanted.items() if stamp is not None}
+        images: dict[str, NDArray] = {}
+        with _opened(self.path) as container:
+            streams = _tracks(container, self.path)
+            container.seek(min(wanted.values()), stream=streams["DEPTH"], backward=True)
+            for packet in container.demux(*(streams[title] for title in wanted)):
+                title = _title(packet.stream)
+                if packet.pts == wanted[title]:
+                    images[title] = _decode(packet, title, f"{where} {title.lower()}")
+                if len(images) == len(wanted) or packet.pts is None:
+                    break
+        for title in wanted:
+            if title not in images:
+                raise FrameError(f"{where}: its {title.lower()} image cannot be read; the recording is damaged there")
+        return images
+
+
+def _decode(packet, title: str, where: str) -> NDArray:
+    """The image in a packet: (H, W) uint16, or (H, W, 3) RGB for the colour track."""
+    stream = packet.stream
+    if title != "COLOR":  # 16-bit big-endian, whatever the machine
+        if packet.size != 2 * stream.width * stream.height:
+            raise FrameError(f"{where}: holds {packet.size} bytes, not those of {stream.width}x{stream.height} 16-bit pixels")
+        return np.frombuffer(bytes(packet), ">u2").reshape(stream.height, stream.width).astype(np.uint16)
+    if stream.codec_context.name == "mjpeg":
+        return decode_color(bytes(packet), where)
+    frames = packet.decode()
+    if not frames:
+        raise FrameError(f"{where}: cannot be decoded")
+    return frames[0].to_ndarray(format="rgb24")
+
+
+def _captures(stamps: dict[str, NDArray[np.int64]]) -> list[Capture]:
+    """A frame for every depth image, with the colour and infrared images that belong to it: within half a period."""
+    depth = stamps["DEPTH"]
+    half = np.median(np.diff(depth)) / 2 if len(depth) > 1 else np.inf
+    found: dict[str, list[int | None]] = {}
+    for title in ("COLOR", "IR"):
+        of = stamps.get(title, np.empty(0, np.int64))
+        near = of[nearest(of, depth)] if len(of) and len(depth) else np.full(len(depth), np.iinfo(np.int64).max)
+        found[title] = [int(stamp) if len(of) and abs(int(stamp) - int(at)) <= half else None
+                        for stamp, at in zip(near, depth, strict=True)]
+    return [Capture(int(at), color, infrared) for at, color, infrared in zip(depth, found["COLOR"], found["IR"], strict=True)]
+
+
+def _read_poses(file: Path, captures: Sequence[Capture], max_difference: float) -> list[Pose]:
+    """The pose of every frame; without a file the first frame is the origin and nothing is known of the others."""
+    if not file.exists():
+        return [Pose("first frame", np.eye(4)), *(Pose(f"no {file.name}") for _ in captures[1:])]
+    rows = sorted(read_tum_rows(file), key=lambda row: row.timestamp)
+    if not rows:
+        raise DatasetError(f"{file}: holds no poses")
+    stamps, times = np.array([row.timestamp for row in rows]), np.array([capture.depth for capture in captures]) * 1e-6
+    nothing = f"no pose within {max_difference} s of the frame"
+    return [rows[i].pose() if abs(stamps[i] - time) <= max_difference else Pose(str(file), problem=nothing)
+            for i, time in zip(nearest(stamps, times), times, strict=True)]
+
+
+def _title(stream) -> str:
+    return stream.metadata.get("title", "").upper()
+
+
+def _tracks(container, path: Path) -> dict:
+    """Title -> video stream of the tracks that are there; depth must be."""
+    streams = {_title(stream): stream for stream in container.streams.video if _title(stream) in TRACKS}
+    if "DEPTH" not in streams:
+        raise DatasetError(f"{path}: has no track DEPTH, only {', '.join(map(_title, container.streams.video)) or 'no video'}; "
+                           "is this a recording of an Azure Kinect?")
+    for title in ("DEPTH", "IR"):
+        if title in streams and streams[title].codec_context.pix_fmt != "gray16be":
+            raise DatasetError(f"{path}: track {title} is {streams[title].codec_context.pix_fmt}, not 16-bit big-endian")
+    return streams
+
+
+@contextmanager
+def _opened(path: Path):
+    """The file as a PyAV container; what PyAV cannot read becomes a DatasetError."""
+    av = _import_av()
+    try:
+        with av.open(str(path)) as container:
+            yield container
+    except av.error.FFmpegError as error:
+        raise DatasetError(f"{path}: not a readable Matroska recording ({error.strerror})") from error
+
+
+def _import_av() -> ModuleType:
+    try:
+        import av
+    except ImportError:
+        raise MissingDependency("recordings of an Azure Kinect are read with PyAV: "
+                                "pip install 'taichi-unifusion[k4a]'") from None
+    return av
