@@ -22,6 +22,7 @@ from .commands.evaluate import METRICS, Evaluate
 from .commands.info import Info, info
 from .commands.mesh import ExtractMesh, extract_mesh
 from .commands.reconstruct import Reconstruct, reconstruct
+from .commands.transfer import Transfer, transfer
 from .config import Config, load_config
 from .errors import FileError, UniFusionError
 from .interrupts import INTERRUPTED
@@ -34,6 +35,7 @@ DESCRIPTION = ("RGB-D frames with camera poses in, a coloured surface out.\n\n"
 
 COMMANDS: dict[str, tuple[type, Callable[..., int] | dict]] = {  # options and function, or a group: its help, its commands
     "reconstruct": (Reconstruct, reconstruct),
+    "transfer": (Transfer, transfer),
     "mesh": (ExtractMesh, extract_mesh),
     "info": (Info, info),
     "config": (ShowConfig, show_config),

@@ -55,6 +55,10 @@ class Config:
     """The map of the surface."""
     color: PropertySettings = field(default_factory=PropertySettings)
     """The map of its colour."""
+    properties: tuple[str, ...] = ()
+    """What else to map, as NAME[=METHOD[:FILE]][,option=value...], for example saliency or style=sketch."""
+    property_map: PropertySettings = field(default_factory=lambda: PropertySettings(voxel_size=0.1))
+    """The maps of these; a property may say otherwise, as in saliency,voxel_size=0.05."""
     mesh: MeshSettings = field(default_factory=MeshSettings)
     """The mesh."""
 

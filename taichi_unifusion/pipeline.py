@@ -1,9 +1,9 @@
-"""Pipeline: posed frames -> surface LIM and colour LIM -> coloured mesh (Fig. 7, left)."""
+"""Pipeline: posed frames -> surface LIM, colour LIM, a LIM for every other property -> mesh (Fig. 7, left)."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -11,27 +11,32 @@ import numpy as np
 
 from . import runtime
 from .config import Config
-from .errors import PoseError, UniFusionError
+from .errors import FrameError, InputError, PoseError, UniFusionError
 from .loading import load_ahead
 from .maps import PropertyMap, SurfaceMap
 from .preprocessing import PreprocessSettings, preprocess
+from .properties import SurfaceProperty, make_property
 from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult, name_of
 from .types import Frame, Mesh
 
 
 class Pipeline:
-    """Fuses frames into a surface map and a colour map.
+    """Fuses frames into a surface map, a colour map, and a map for every property that the configuration or the caller names.
 
-        pipeline = Pipeline(Config())
+        pipeline = Pipeline(Config(properties=("saliency",)))
         pipeline.run(open_dataset("7scenes", path)[::10])
         pipeline.extract_mesh().save("kitchen.ply")
     """
 
-    def __init__(self, config: Config | None = None) -> None:
+    def __init__(self, config: Config | None = None, properties: Iterable[SurfaceProperty] = ()) -> None:
         self.config = config or Config()
+        made = (make_property(text, self.config.property_map) for text in self.config.properties)
+        self.sources = _by_name((*made, *properties))
         runtime.init(self.config.device, threads=self.config.threads or None)
         self.surface = SurfaceMap(self.config.surface)
-        self.properties = {"color": PropertyMap("color", 3, self.config.color)}
+        self.properties = {"color": PropertyMap("color", 3, self.config.color),
+                           **{name: PropertyMap(name, source.channels, source.settings or self.config.property_map)
+                              for name, source in self.sources.items()}}
 
     @property
     def maps(self) -> dict[str, SurfaceMap | PropertyMap]:
@@ -39,7 +44,7 @@ class Pipeline:
         return {"surface": self.surface, **self.properties}
 
     def step(self, frame: Frame) -> StepResult:
-        """Fuse one frame; a property that the frame lacks is left out.
+        """Fuse one frame; a property that the frame lacks, or does not allow to be made, is left out.
 
         Raises FrameError where the frame has no pose or no usable depth, OutOfRange where it lies beyond a map's index range,
         CapacityError where a map would grow beyond safe memory.
@@ -47,6 +52,7 @@ class Pipeline:
         clock = StageClock()
         if frame.T_world_camera is None:
             raise PoseError(f"{name_of(frame)}: there is no pose for this frame")
+        frame, lacking = self._with_properties(frame, clock)
         with clock.stage("preprocess"):
             cloud = preprocess(frame, self.config.preprocess)
         if len(cloud) == 0:
@@ -58,7 +64,19 @@ class Pipeline:
             if target is self.surface or name in cloud.attributes:
                 with clock.stage(name):
                     integrations[name] = target.integrate(cloud)
-        return StepResult(frame.index, frame.name, len(cloud), integrations, clock.milliseconds)
+        return StepResult(frame.index, frame.name, len(cloud), integrations, clock.milliseconds, lacking)
+
+    def _with_properties(self, frame: Frame, clock: StageClock) -> tuple[Frame, dict[str, str]]:
+        """The frame with an image of every property (f_im, Fig. 6), and by name why one cannot be had."""
+        lacking = {}
+        for name, source in self.sources.items():
+            try:
+                with clock.stage(f"{name} image"):
+                    frame = frame.with_image(name, source.image(frame))
+            except FrameError as error:
+                lacking[name] = str(error)
+                frame = frame.without_image(name)
+        return frame, lacking
 
     def run(self, sequence: Sequence[Frame], *, strict: bool = False, stop: Callable[[], bool] = lambda: False,
             on_frame: Callable[[int, int], None] = lambda done, total: None) -> RunResult:
@@ -91,6 +109,15 @@ class Pipeline:
         """The mesh of all that was fused so far, coloured; `resolution` overrides the configuration's."""
         mesh = self.config.mesh
         return extract_mesh(self.surface, self.properties, mesh.resolution if resolution is None else resolution, mesh.min_area)
+
+
+def _by_name(properties: Iterable[SurfaceProperty]) -> dict[str, SurfaceProperty]:
+    named: dict[str, SurfaceProperty] = {}
+    for made in properties:
+        if named.setdefault(made.name, made) is not made:
+            raise InputError(f"property '{made.name}' is asked for twice; give one of them another name, as in "
+                             f"{made.name},name=other")
+    return named
 
 
 def extract_mesh(surface: SurfaceMap, properties: Mapping[str, PropertyMap], resolution: int, min_area: float = 0.0) -> Mesh:

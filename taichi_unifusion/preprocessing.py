@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import runtime
 from .errors import InputError
@@ -53,14 +54,9 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
     settings = settings or PreprocessSettings()
     camera = frame.camera
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    raw = np.ascontiguousarray(frame.depth)
-    depth, inverse, normals, pixels = _scratch(live, raw.shape)
-    kernels.clip_depth(raw, settings.depth_min, settings.depth_max, depth)
-    kernels.drop_flying_pixels(depth, settings.edge_jump, settings.edge_support, inverse)
-    kernels.estimate_normals(inverse, *intrinsics, settings.normal_radius, settings.edge_jump,
-                             float(np.cos(np.radians(settings.max_angle))), normals)
-
-    counts = np.empty(-(-raw.size // kernels.PIXEL_CHUNK), np.int32)
+    depth, inverse, normals, pixels = _scratch(live, frame.depth.shape)
+    _find_normals(frame, settings, depth, inverse, normals)
+    counts = np.empty(-(-frame.depth.size // kernels.PIXEL_CHUNK), np.int32)
     kernels.count_points(normals, counts)
     runtime.synchronize()
     total = int(counts.sum())
@@ -86,6 +82,24 @@ def _view(frame: Frame, settings: PreprocessSettings) -> DepthView:
     depth = np.empty_like(frame.depth)
     kernels.clip_depth(np.ascontiguousarray(frame.depth), settings.depth_min, FARTHEST, depth)
     return DepthView(depth, frame.camera, np.eye(4))
+
+
+def normal_image(frame: Frame, settings: PreprocessSettings | None = None) -> NDArray[np.float32]:
+    """Unit normals (H, W, 3) towards the camera, in camera coordinates, of a frame's usable pixels; 0 elsewhere."""
+    depth, inverse, normals, _ = _scratch(runtime.current(), frame.depth.shape)
+    _find_normals(frame, settings or PreprocessSettings(), depth, inverse, normals)
+    return normals.to_numpy()
+
+
+def _find_normals(frame: Frame, settings: PreprocessSettings, depth, inverse, normals) -> None:
+    """Fill the scratch images from the depth image."""
+    from .kernels import images as kernels
+
+    camera = frame.camera
+    kernels.clip_depth(np.ascontiguousarray(frame.depth), settings.depth_min, settings.depth_max, depth)
+    kernels.drop_flying_pixels(depth, settings.edge_jump, settings.edge_support, inverse)
+    kernels.estimate_normals(inverse, camera.fx, camera.fy, camera.cx, camera.cy, settings.normal_radius, settings.edge_jump,
+                             float(np.cos(np.radians(settings.max_angle))), normals)
 
 
 def _scratch(live: runtime.Runtime, shape: tuple[int, int]) -> tuple:

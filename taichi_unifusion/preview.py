@@ -52,10 +52,16 @@ class View:
 
 def render_preview(mesh: Mesh, path: str | os.PathLike, *, trajectory: Trajectory | None = None,
                    views: Sequence[str] | None = None, size: tuple[int, int] = (960, 720)) -> None:
-    """Write one PNG with pictures of `mesh`, each of `size` (width, height) pixels, side by side.
+    """Write what `draw_preview` gives as a PNG; raises FileError on writing."""
+    write_png(path, draw_preview(mesh, trajectory=trajectory, views=views, size=size))
+
+
+def draw_preview(mesh: Mesh, *, trajectory: Trajectory | None = None, views: Sequence[str] | None = None,
+                 size: tuple[int, int] = (960, 720)) -> NDArray[np.uint8]:
+    """One picture (H, W, 3) RGB of views of `mesh`, each of `size` (width, height) pixels, side by side.
 
     `views` are names of VIEWS: camera and overview where there are poses, else overview and opposite. Up is the mean of the
-    cameras' up, or +z. Raises InputError for a mesh without a finite triangle or an unknown view, FileError on writing.
+    cameras' up, or +z. Raises InputError for a mesh without a finite triangle or an unknown view.
     """
     has_poses = trajectory is not None and len(trajectory) > 0
     names = tuple(views) if views else (("camera", "overview") if has_poses else ("overview", "opposite"))
@@ -70,7 +76,7 @@ def render_preview(mesh: Mesh, path: str | os.PathLike, *, trajectory: Trajector
     chosen = _choose_views(drawable, trajectory if has_poses else None, names, size)
     gap = np.full((size[1], max(2, size[0] // 120), 3), 255, np.uint8)
     panels = [panel for view in chosen for panel in (gap, _draw(drawable, view))]
-    _write_png(path, np.hstack(panels[1:]))
+    return np.hstack(panels[1:])
 
 
 def render_mesh(mesh: Mesh, view: View) -> NDArray[np.uint8]:
@@ -149,7 +155,8 @@ def _rasterize(drawable: _Drawable, camera: PinholeCamera, T_world_camera: NDArr
     return nearest, projection
 
 
-def _write_png(path: str | os.PathLike, image: NDArray[np.uint8]) -> None:
+def write_png(path: str | os.PathLike, image: NDArray[np.uint8]) -> None:
+    """Write an RGB picture (H, W, 3) atomically; raises FileError where that fails."""
     import cv2
 
     content = cv2.imencode(".png", image[..., ::-1])[1]

@@ -22,9 +22,11 @@ from .config import dump_config
 from .errors import FileError, InputError
 from .io import atomic_write, check_writable, write_mesh, write_trajectory
 from .pipeline import Pipeline
-from .preview import render_preview
+from .preview import draw_preview, render_preview, write_png
+from .properties.base import Look
+from .properties.legend import draw_legend, property_mesh, shown_range
 from .run_log import RunResult, StepResult
-from .types import Mesh
+from .types import Mesh, Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -98,6 +100,8 @@ def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, abo
     extracted = time.perf_counter()
     if mesh is not None:
         _write_mesh_files(folder, mesh, pipeline, run)
+        for name, source in pipeline.sources.items():
+            _write_property(folder, mesh, name, source.look, pipeline, run)
     seconds = {"frames": run.seconds, "mesh": extracted - extracting,
                "write": time.perf_counter() - started - (extracted - extracting)}
     metrics = {**(about or {}), **_metrics(folder, pipeline, run, mesh, seconds)}
@@ -123,6 +127,39 @@ def _write_mesh_files(folder: ResultsFolder, mesh: Mesh, pipeline: Pipeline, run
         folder.remove("preview.png")
 
 
+def _write_property(folder: ResultsFolder, mesh: Mesh, name: str, look: Look, pipeline: Pipeline, run: RunResult) -> None:
+    """The mesh in the colours of a property, with its values, and a picture of it with a legend."""
+    if name not in mesh.attributes:
+        reasons = [step.lacking[name] for step in run.steps if name in step.lacking]
+        first = f" (first: {reasons[0]})" if reasons else ""
+        folder.failures.append(InputError(f"property '{name}' is empty: none of {len(run.steps)} frames gave it{first}"))
+        for file in property_files(name):
+            folder.remove(file)
+        return
+    shown = property_mesh(mesh, name, look)
+    wanted = {f"{name}.{suffix}" for suffix in pipeline.config.mesh.formats}
+    for file in property_files(name):
+        if file in wanted:
+            folder.write(file, lambda path: write_mesh(path, shown))
+        elif file != f"{name}.png" or "color" not in shown.attributes:
+            folder.remove(file)
+    if "color" in shown.attributes:
+        folder.write(f"{name}.png", lambda path: write_property_picture(path, shown, name, look, run.trajectory))
+
+
+def property_files(name: str) -> tuple[str, ...]:
+    """Files of a property beside its map."""
+    return (*(f"{name}{Path(file).suffix}" for file in MESH_FILES), f"{name}.png")
+
+
+def write_property_picture(path: Path, shown: Mesh, name: str, look: Look, trajectory: Trajectory | None) -> None:
+    """A picture of a mesh in the colours of its property `name`, above their legend."""
+    picture = draw_preview(shown, trajectory=trajectory)
+    values = shown.attributes[name]
+    legend = draw_legend(picture.shape[1], name, look, *shown_range(values, look), values.shape[1])
+    write_png(path, np.vstack([picture, legend]))
+
+
 def _metrics(folder: ResultsFolder, pipeline: Pipeline, run: RunResult, mesh: Mesh | None,
              seconds: Mapping[str, float]) -> dict[str, Any]:
     """What `metrics.json` holds; JSON values only."""
@@ -143,6 +180,7 @@ def _metrics(folder: ResultsFolder, pipeline: Pipeline, run: RunResult, mesh: Me
         "maps": {name: {"voxel_size": target.voxel_size, "voxels": len(target), "bytes": target.memory_bytes,
                         "file_bytes": _size(folder.directory / "maps" / f"{name}.safetensors")}
                  for name, target in pipeline.maps.items()},
+        "properties": {name: _shown(mesh, name, source.look, run) for name, source in pipeline.sources.items()},
         "mesh": None if mesh is None else {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)},
         "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,  # Linux counts KiB
         "files": {name: _size(folder.directory / name) for name in folder.files},
@@ -150,6 +188,13 @@ def _metrics(folder: ResultsFolder, pipeline: Pipeline, run: RunResult, mesh: Me
         "errors": [str(error) for error in (run.failure, *folder.failures) if error is not None],
         "versions": versions(),
     }
+
+
+def _shown(mesh: Mesh | None, name: str, look: Look, run: RunResult) -> dict[str, Any]:
+    """How a property's values were coloured, and how many frames gave it."""
+    values = None if mesh is None else mesh.attributes.get(name)
+    return {"frames": sum(name in step.integrations for step in run.steps), "label": look.label or name,
+            "colormap": look.colormap, "range": None if values is None else list(shown_range(values, look))}
 
 
 def stage_milliseconds(steps: tuple[StepResult, ...]) -> dict[str, dict[str, float]]:

@@ -6,7 +6,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -44,6 +44,7 @@ class StepResult:
     points: int                               # after preprocessing
     integrations: Mapping[str, Integration]   # by map
     milliseconds: Mapping[str, float]         # by stage
+    lacking: Mapping[str, str] = field(default_factory=dict)  # property -> why the frame does not give it
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,9 @@ class RunLog:
         if frame.color is None and not self.color_missing:
             self.color_missing = True
             self.warn(f"{name_of(frame)}: there is no colour image; frames without one add to the surface only")
+        for name, reason in step.lacking.items():
+            if not any(name in earlier.lacking for earlier in self.steps):
+                self.warn(f"{reason}; frames without it add to the other maps only")
         self.steps.append(replace(step, milliseconds={"load": 1e3 * waited, **step.milliseconds}))
         self.poses.append((frame.timestamp, frame.T_world_camera))
         self.check_poses(frame)

@@ -113,6 +113,10 @@ class Frame:
         image = np.ascontiguousarray(image, dtype=np.float32)
         return replace(self, images={**self.images, name: image[..., None] if image.ndim == 2 else image})
 
+    def without_image(self, name: str) -> Frame:
+        """A copy that lacks the property image `name`."""
+        return replace(self, images={key: image for key, image in self.images.items() if key != name})
+
 
 @dataclass(frozen=True)
 class DepthView:

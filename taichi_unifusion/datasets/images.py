@@ -78,6 +78,22 @@ def read_infrared(path: Path) -> NDArray[np.float32]:
     return image.astype(np.float32) * np.float32(257 if image.dtype == np.uint8 else 1)  # 255 * 257 = 65535
 
 
+def read_values(path: Path) -> NDArray[np.float32]:
+    """The numbers at `path` as (H, W, c) float32: a `.npy` array as it is, a picture of 8 or 16 bits (RGB) as [0, 1]."""
+    if path.suffix.lower() == ".npy":
+        array = np.array(_open_npy(path))
+        if array.ndim not in (2, 3) or array.dtype.kind not in "fiub":
+            raise FrameError(f"{path}: must hold (H, W) or (H, W, c) numbers, got {array.shape} {array.dtype}")
+        return np.ascontiguousarray(array.reshape(*array.shape[:2], -1), np.float32)
+    image = _decode(_read_bytes(path), str(path))
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FrameError(f"{path}: a picture must have 8 or 16 bits a channel, got {image.dtype}")
+    image = image.reshape(*image.shape[:2], -1)
+    if image.shape[2] >= 3:  # OpenCV has blue first
+        image = image[..., [2, 1, 0, *range(3, image.shape[2])]]
+    return np.ascontiguousarray(image, np.float32) / np.float32(np.iinfo(image.dtype).max)
+
+
 def depth_file_size(path: Path) -> tuple[int, int]:
     """(width, height) of the depth image at `path`, from its header alone."""
     if path.suffix.lower() == ".npy":

@@ -1,0 +1,37 @@
+"""The paper's f_im (Fig. 6): functions that give an image of a property for every frame, by name.
+
+`make_property("style=sketch,voxel_size=0.05")` gives one of these, with options; your own is a `SurfaceProperty` with a function.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .base import Look, SurfaceProperty
+    from .specification import make_property
+
+PROPERTIES: dict[str, dict[str, tuple[str, str]]] = {  # name -> method -> module here, what makes it; the first is the default
+    "infrared": {"log": ("infrared", "log_infrared"), "linear": ("infrared", "linear_infrared")},
+    "saliency": {"spectral": ("saliency", "spectral_saliency"), "onnx": ("saliency", "network_saliency")},
+    "style": {"painting": ("style", "painting_style"), "sketch": ("style", "sketch_style"), "onnx": ("style", "network_style")},
+    "images": {"folder": ("images", "folder_images")},
+    "normal": {"depth": ("geometry", "surface_normal")},
+    "curvature": {"depth": ("geometry", "mean_curvature")},
+}
+
+__all__ = ["PROPERTIES", "Look", "SurfaceProperty", "make_property"]
+
+_MODULES = {"Look": "base", "SurfaceProperty": "base", "make_property": "specification"}
+
+
+def __getattr__(name: str):
+    if name not in _MODULES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    value = globals()[name] = getattr(import_module(f".{_MODULES[name]}", __name__), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

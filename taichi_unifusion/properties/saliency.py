@@ -1,0 +1,78 @@
+"""Saliency: how much each pixel draws the eye, in [0, 1] (Sec. V-B)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..types import Frame
+from .base import Look, SurfaceProperty, color_of
+from .networks import IMAGENET_MEAN, IMAGENET_STD, ImageNetwork, check_choice, prepare
+
+LOOK = Look("viridis", (0.0, 1.0), "saliency")
+SPECTRUM_SIZE = 64     # pixels of the longer side: coarse, so that objects count and not their texture
+BLUR = 2.5             # [pixels] of that picture
+BRIGHTEST = 99.5       # percentile that becomes 1
+RANGE_SLACK = 0.01     # of a network that gives [0, 1], for rounding
+
+
+def spectral_saliency() -> SurfaceProperty:
+    """The simple one: what the spectral residual (Hou and Zhang 2007) of lightness and colour leaves; no weights, no learning.
+
+    It finds what differs from the picture's general texture; a salient-object network finds whole objects.
+    """
+
+    def function(frame: Frame) -> NDArray[np.float32]:
+        color = color_of(frame)
+        height, width = color.shape[:2]
+        scale = SPECTRUM_SIZE / max(height, width)
+        small = cv2.resize(color, (max(8, round(width * scale)), max(8, round(height * scale))), interpolation=cv2.INTER_AREA)
+        lab = cv2.cvtColor(np.float32(small) / 255, cv2.COLOR_RGB2Lab)
+        salient = cv2.GaussianBlur(sum(spectral_residual(channel) for channel in cv2.split(lab)), None, BLUR)
+        salient -= salient.min()
+        salient /= max(float(np.percentile(salient, BRIGHTEST)), 1e-12)
+        return np.clip(cv2.resize(salient, (width, height), interpolation=cv2.INTER_CUBIC), 0, 1)
+
+    return SurfaceProperty("saliency", 1, function, LOOK)
+
+
+def spectral_residual(channel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Energy (H, W) of an image whose log spectrum is replaced by its difference to the local mean, phases kept."""
+    spectrum = np.fft.fft2(channel)
+    amplitude = np.log(np.abs(spectrum) + 1e-6)
+    residual = amplitude - cv2.blur(amplitude, (3, 3), borderType=cv2.BORDER_WRAP)
+    return np.float32(np.abs(np.fft.ifft2(np.exp(residual + 1j * np.angle(spectrum)))) ** 2)
+
+
+def network_saliency(file: Path, *, size: tuple[int, int] | None = None, mean: tuple[float, ...] = IMAGENET_MEAN,
+                     std: tuple[float, ...] = IMAGENET_STD, scale: float = 1.0, order: Literal["rgb", "bgr"] = "rgb",
+                     output: str = "", activation: Literal["none", "sigmoid", "minmax"] = "none",
+                     device: Literal["auto", "cpu", "cuda"] = "auto", sha256: str = "") -> SurfaceProperty:
+    """A salient-object network in an ONNX file (U2-Net, InSPyReNet and their like): an image in, one channel out.
+
+    The image is resized to `size` (the network's own where it is fixed), scaled to 0..`scale`, and normalised by `mean` and
+    `std`. `activation`: what is still to be done to the output named `output` (the first): nothing, sigmoid, or stretching each
+    frame to [0, 1].
+    """
+    check_choice("activation", activation, ("none", "sigmoid", "minmax"))
+    network = ImageNetwork(file, size=size, output=output, channels=1, device=device, sha256=sha256)
+
+    def function(frame: Frame) -> NDArray[np.float32]:
+        color = color_of(frame)
+        values = network(prepare(color, scale, mean, std, order), color.shape[:2])[..., 0]
+        if activation == "sigmoid":
+            return 1 / (1 + np.exp(-np.clip(values, -60, 60)))
+        low, high = float(values.min()), float(values.max())
+        if activation == "minmax":
+            return (values - low) / max(high - low, 1e-12)
+        if low < -RANGE_SLACK or high > 1 + RANGE_SLACK:
+            raise InputError(f"{file}: its output runs from {low:.3g} to {high:.3g}, which is no saliency of 0 to 1; say "
+                             "activation=sigmoid or activation=minmax, or choose another output")
+        return np.clip(values, 0, 1)
+
+    return SurfaceProperty("saliency", 1, function, LOOK)

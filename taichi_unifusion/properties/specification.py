@@ -1,0 +1,120 @@
+"""Properties as text: `NAME`, `NAME=METHOD`, `NAME=METHOD:FILE`, each with `,option=value` after it.
+
+    saliency
+    saliency=onnx:u2net.onnx,size=320x320,activation=minmax
+    style=sketch,color=true,name=drawing,voxel_size=0.05
+    images=heat/,name=heat
+
+Options are those of the method, `name` (of the map and its files), and the settings of a property map.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import inspect
+import math
+import re
+from collections.abc import Collection
+from importlib import import_module
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from ..config import Config
+from ..errors import InputError
+from ..maps.settings import PropertySettings
+from . import PROPERTIES
+from .base import SurfaceProperty
+
+OPTION = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)=(.*)", re.DOTALL)
+
+
+def make_property(text: str, settings: PropertySettings | None = None) -> SurfaceProperty:
+    """The property that the text names; `settings` of its map where the text says nothing else (the configuration's defaults without them).
+
+    Raises InputError, with the right names, for an unknown property, method or option or a value that does not fit, and
+    whatever making it raises: FileError for a model that is missing, MissingDependency for a package.
+    """
+    name, _, rest = text.partition("=")
+    methods = PROPERTIES.get(name)
+    if methods is None:
+        raise InputError(f"property '{name}' is unknown{_suggest(name, PROPERTIES)}; properties: {', '.join(PROPERTIES)}")
+    method, file, options = _split(name, rest, methods)
+    module, function = methods[method]
+    maker = getattr(import_module(f".{module}", __package__), function)
+    parameters = inspect.signature(maker).parameters
+    if ("file" in parameters) != bool(file):
+        raise InputError(f"property '{text}': " + (f"'{name}={method}' takes no file" if file else
+                                                   f"give the file, as in {name}={method}:FILE"))
+    of_map = {field.name: field for field in dataclasses.fields(PropertySettings) if field.name != "encoder"}
+    known = [key for key in (*parameters, "name", *of_map) if key != "file"]
+    for key in options:
+        if key not in known:
+            raise InputError(f"property '{text}': option '{key}' is unknown{_suggest(key, known)}; options: {', '.join(known)}")
+    types, map_types = get_type_hints(maker), get_type_hints(PropertySettings)
+    given = {key: _convert(value, types[key], f"property '{text}': {key}") for key, value in options.items() if key in parameters}
+    changes = {key: _convert(value, map_types[key], f"property '{text}': {key}")
+               for key, value in options.items() if key in of_map}
+    made = maker(Path(file).expanduser(), **given) if file else maker(**given)
+    settings = dataclasses.replace(settings or Config().property_map, **changes)
+    return dataclasses.replace(made, name=options.get("name", name), settings=settings)
+
+
+def _split(name: str, rest: str, methods: dict) -> tuple[str, str, dict[str, str]]:
+    """Method, file and options of what follows `NAME=`."""
+    method, file, words = next(iter(methods)), "", rest.split(",") if rest else []
+    if words and not OPTION.fullmatch(words[0].partition(":")[0]):
+        first, colon, after = words.pop(0).partition(":")
+        if first in methods:
+            method, file = first, after
+        elif len(methods) == 1:  # only one way to make it: what follows is its file
+            file = first + colon + after
+        else:
+            raise InputError(f"property '{name}': method '{first}' is unknown{_suggest(first, methods)}; methods: "
+                             f"{', '.join(methods)}")
+    options: dict[str, str] = {}
+    for word in words:
+        found = OPTION.fullmatch(word)
+        if not found or found[1] in options:
+            raise InputError(f"property '{name}': '{word}' is {'given twice' if found else 'no option=value'}")
+        options[found[1]] = found[2]
+    return method, file, options
+
+
+def _convert(text: str, wanted: Any, at: str) -> Any:
+    """The text as the type `wanted`, or InputError."""
+    if get_origin(wanted) in (Union, type(int | None)):
+        wanted = next(option for option in get_args(wanted) if option is not NoneType)
+    try:
+        if get_origin(wanted) is Literal:
+            if text not in get_args(wanted):
+                raise InputError(f"{at}: '{text}' is unknown, choose one of {', '.join(get_args(wanted))}")
+            return text
+        if get_origin(wanted) is tuple:  # a size as 320x240, other numbers as 0.5/0.5/0.5
+            whole = get_args(wanted)[0] is int
+            numbers = tuple(int(word) if whole else _number(word) for word in text.split("x" if whole else "/"))
+            if Ellipsis not in get_args(wanted) and len(numbers) != len(get_args(wanted)):
+                raise ValueError
+            return numbers
+        if wanted is bool:
+            return {"true": True, "false": False}[text.lower()]
+        return {float: _number, int: int, str: str}[wanted](text)
+    except (ValueError, KeyError) as error:
+        if isinstance(error, InputError):
+            raise
+        kinds = {float: "a number", int: "a whole number", bool: "true or false"}
+        kind = kinds.get(wanted) or ("WIDTHxHEIGHT" if get_args(wanted)[0] is int else "numbers with / between them")
+        raise InputError(f"{at}: expected {kind}, got '{text}'") from None
+
+
+def _number(word: str) -> float:
+    value = float(word)
+    if not math.isfinite(value):
+        raise ValueError
+    return value
+
+
+def _suggest(word: str, known: Collection[str]) -> str:
+    near = difflib.get_close_matches(word.lower(), list(known), n=1)
+    return f", did you mean '{near[0]}'?" if near else ""

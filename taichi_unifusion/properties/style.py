@@ -1,0 +1,90 @@
+"""Style: every frame as a painter would show it, RGB in [0, 1] (Sec. V-B, Fig. 14)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..types import Frame
+from .base import Look, SurfaceProperty, color_of
+from .networks import ImageNetwork, check_choice, prepare
+
+LOOK = Look(label="style")
+OVERSHOOT = 10.0  # times the stated range that an output may reach before the range must be wrong
+
+
+def painting_style(*, smoothness: float = 60.0, detail: float = 0.45) -> SurfaceProperty:
+    """OpenCV's stylisation: flat, bright regions within dark contours; no weights. `smoothness` in pixels, `detail` in 0..1."""
+
+    def function(frame: Frame) -> NDArray[np.float32]:
+        painted = cv2.stylization(_bgr_of(frame), sigma_s=_smoothness(smoothness), sigma_r=_detail(detail))
+        return _as_rgb(painted)
+
+    _smoothness(smoothness), _detail(detail)
+    return SurfaceProperty("style", 3, function, LOOK)
+
+
+def sketch_style(*, color: bool = False, smoothness: float = 60.0, detail: float = 0.07,
+                 shade: float = 0.05) -> SurfaceProperty:
+    """OpenCV's pencil drawing, grey or in `color`; no weights. `shade` in 0..0.1 makes it darker."""
+    if not 0 <= shade <= 0.1:
+        raise InputError(f"style: shade must lie in 0..0.1, got {shade}")
+
+    def function(frame: Frame) -> NDArray[np.float32]:
+        grey, colored = cv2.pencilSketch(_bgr_of(frame), sigma_s=_smoothness(smoothness), sigma_r=_detail(detail),
+                                         shade_factor=shade)
+        return _as_rgb(colored if color else cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+
+    _smoothness(smoothness), _detail(detail)
+    return SurfaceProperty("style", 3, function, LOOK)
+
+
+def network_style(file: Path, *, size: tuple[int, int] | None = None, mean: tuple[float, ...] = (0.0, 0.0, 0.0),
+                  std: tuple[float, ...] = (1.0, 1.0, 1.0), scale: float = 255.0, order: Literal["rgb", "bgr"] = "rgb",
+                  output: str = "", output_scale: float = 255.0, device: Literal["auto", "cpu", "cuda"] = "auto",
+                  sha256: str = "") -> SurfaceProperty:
+    """An image-to-image network in an ONNX file (fast neural style, MSG-Net and their like): an image in, an image out.
+
+    The image is resized to `size` (the network's own where it is fixed), scaled to 0..`scale`, and normalised by `mean` and
+    `std`; the output named `output` (the first) runs over 0..`output_scale`. `order` holds for both.
+    """
+    if not output_scale > 0:
+        raise InputError(f"style: output_scale must be positive, got {output_scale}")
+    check_choice("order", order, ("rgb", "bgr"))
+    network = ImageNetwork(file, size=size, output=output, channels=3, device=device, sha256=sha256)
+
+    def function(frame: Frame) -> NDArray[np.float32]:
+        color = color_of(frame)
+        values = network(prepare(color, scale, mean, std, order), color.shape[:2])
+        largest = float(np.abs(values).max())
+        if largest > OVERSHOOT * output_scale or OVERSHOOT * largest < output_scale / 10:
+            raise InputError(f"{file}: its output reaches {largest:.3g}, which does not fit a range of 0 to {output_scale:g}; "
+                             f"say output_scale={'1' if largest < 10 else '255'}")
+        return np.clip((values if order == "rgb" else values[..., ::-1]) / np.float32(output_scale), 0, 1)
+
+    return SurfaceProperty("style", 3, function, LOOK)
+
+
+def _bgr_of(frame: Frame) -> NDArray[np.uint8]:
+    return cv2.cvtColor(color_of(frame), cv2.COLOR_RGB2BGR)
+
+
+def _as_rgb(bgr: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.float32(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)) / 255
+
+
+def _smoothness(value: float) -> float:
+    if not 0 < value <= 200:
+        raise InputError(f"style: smoothness must lie above 0 and at most at 200 pixels, got {value}")
+    return value
+
+
+def _detail(value: float) -> float:
+    if not 0 < value <= 1:
+        raise InputError(f"style: detail must lie above 0 and at most at 1, got {value}")
+    return value
