@@ -12,7 +12,6 @@ camera that is aligned to. Without such a file the first frame's camera is the w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,7 +49,7 @@ def open_k4a(path: Path, *, align: Literal["depth", "color"] = "depth", depth_sc
 
 @dataclass(frozen=True)
 class Capture:
-    """Time stamps [us] of the images of one frame; None: the recording lacks that one."""
+    """Time stamps of the images of one frame, in the file's unit; None: the recording lacks that one."""
 
     depth: int
     color: int | None
@@ -69,6 +68,7 @@ class K4aFile(Dataset):
             if attached is None:
                 raise DatasetError(f"{path}: no {CALIBRATION} is attached; was the recording converted by another program?")
             self.calibration = read_calibration(attached, f"{path}: {CALIBRATION}", self.sizes["DEPTH"], self.sizes.get("COLOR"))
+            self.unit = float(streams["DEPTH"].time_base)  # [s] of a time stamp; a Matroska file has one for all tracks
             stamps = {title: [] for title in streams}
             for packet in container.demux(*streams.values()):
                 if packet.pts is not None:
@@ -78,8 +78,12 @@ class K4aFile(Dataset):
             raise DatasetError(f"{path}: holds no depth image")
         if align == "color" and self.calibration.color is None:
             raise DatasetError(f"{path}: align 'color' needs a colour track, and this recording has none")
-        self.poses = _read_poses(path.with_suffix(".txt"), self.captures, max_difference)
-        self.warnings = tuple(pose_warnings(self.poses))
+        times = self.unit * np.array([capture.depth for capture in self.captures])
+        self.poses = _read_poses(path.with_suffix(".txt"), times, max_difference)
+        self.warnings = tuple(pose_warnings([pose for pose in self.poses if pose.T_world_camera is not None or pose.problem]))
+        if any(pose.T_world_camera is None and not pose.problem for pose in self.poses):
+            self.warnings = (f"there is no {path.with_suffix('.txt').name} with poses beside {path.name}: the first frame's camera "
+                             "is the world, and the other frames have no pose",)
 
     @property
     def camera(self):
@@ -100,7 +104,7 @@ class K4aFile(Dataset):
         infrared = images["IR"].astype(np.float32) if "IR" in images else np.zeros(raw.shape, np.float32)
         register = self._to_color if self.align == "color" else self._to_depth
         depth, color, infrared = register(depth, images.get("COLOR"), infrared)
-        frame = Frame(depth, self.camera, color, T_world_camera, index, capture.depth * 1e-6, where)
+        frame = Frame(depth, self.camera, color, T_world_camera, index, capture.depth * self.unit, where)
         return frame.with_image("infrared", infrared) if "IR" in images else frame
 
     def _to_depth(self, depth: NDArray, color: NDArray | None, infrared: NDArray) -> tuple[NDArray, NDArray | None, NDArray]:
@@ -108,9 +112,7 @@ class K4aFile(Dataset):
         depth = cameras.depth.undistort_depth(depth, camera)
         infrared = cameras.depth.undistort(infrared, camera)
         if color is not None:
-            color_camera = cameras.color.pinhole
-            color, seen = color_for_depth(cameras.color.undistort(color, color_camera), color_camera, depth, camera,
-                                          cameras.T_color_depth)
+            color, seen = color_for_depth(color, cameras.color, depth, camera, cameras.T_color_depth)
             depth[~seen] = 0
         return depth, color, infrared
 
@@ -121,6 +123,7 @@ class K4aFile(Dataset):
         finer = own.resized(own.width * factor, own.height * factor)
         depth, infrared = splat_depth(cameras.depth.undistort_depth(depth, finer), cameras.depth.undistort(infrared, finer),
                                       finer, camera, cameras.T_color_depth)
+        depth[~cameras.color.sees(camera)] = 0
         return depth, None if color is None else cameras.color.undistort(color, camera), infrared
 
     def _read(self, capture: Capture, where: str) -> dict[str, NDArray]:
@@ -171,15 +174,14 @@ def _captures(stamps: dict[str, NDArray[np.int64]]) -> list[Capture]:
     return [Capture(int(at), color, infrared) for at, color, infrared in zip(depth, found["COLOR"], found["IR"], strict=True)]
 
 
-def _read_poses(file: Path, captures: Sequence[Capture], max_difference: float) -> list[Pose]:
-    """The pose of every frame; without a file the first frame is the origin and nothing is known of the others."""
+def _read_poses(file: Path, times: NDArray[np.float64], max_difference: float) -> list[Pose]:
+    """The pose of every frame, by its time [s]; without a file the first frame is the origin and nothing is known of others."""
     if not file.exists():
-        return [Pose("first frame", np.eye(4)), *(Pose(f"no {file.name}") for _ in captures[1:])]
+        return [Pose("first frame", np.eye(4)), *(Pose(f"no {file.name}") for _ in times[1:])]
     rows = sorted(read_tum_rows(file), key=lambda row: row.timestamp)
     if not rows:
         raise DatasetError(f"{file}: holds no poses")
-    stamps, times = np.array([row.timestamp for row in rows]), np.array([capture.depth for capture in captures]) * 1e-6
-    nothing = f"no pose within {max_difference} s of the frame"
+    stamps, nothing = np.array([row.timestamp for row in rows]), f"no pose within {max_difference} s of the frame"
     return [rows[i].pose() if abs(stamps[i] - time) <= max_difference else Pose(str(file), problem=nothing)
             for i, time in zip(nearest(stamps, times), times, strict=True)]
 

@@ -31,6 +31,12 @@ class LensCamera:
         """Colours (H, W, 3) or measurements (H, W) as `target`, in the same place and direction, sees them; 0 outside."""
         return cv2.remap(image, *_undistortion(self, target), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
+    def sees(self, target: PinholeCamera) -> NDArray[np.bool_]:
+        """Where (H, W) this camera's image covers what `target`, in the same place and direction, sees."""
+        map_x, map_y = _undistortion(self, target)
+        width, height = self.pinhole.size
+        return (map_x >= 0) & (map_y >= 0) & (map_x <= width - 1) & (map_y <= height - 1)
+
     def undistort_depth(self, depth: NDArray[np.float32], target: PinholeCamera) -> NDArray[np.float32]:
         """The same for depth (H, W) [m], 0 none: never a mean across an edge."""
         map_x, map_y = _undistortion(self, target)
@@ -76,23 +82,27 @@ def project_depth(depth: NDArray[np.float32], camera: PinholeCamera, target: Pin
     return columns, rows, z
 
 
-def color_for_depth(color: NDArray[np.uint8], color_camera: PinholeCamera, depth: NDArray[np.float32], camera: PinholeCamera,
+def color_for_depth(color: NDArray[np.uint8], lens: LensCamera, depth: NDArray[np.float32], camera: PinholeCamera,
                     T_color_camera: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colour (H, W, 3) for every pixel of a depth image, and where (H, W) the colour camera sees the point of a reading.
 
     It does not where the point lies outside its image or behind something nearer. Pixels without a reading are coloured as if
     they had their neighbours', so that the picture is whole.
     """
+    color_camera = lens.pinhole
     columns, rows, z = project_depth(_filled(depth), camera, color_camera, T_color_camera)
     width, height = color_camera.size
     inside = (columns > -0.5) & (rows > -0.5) & (columns < width - 0.5) & (rows < height - 0.5)
+    covered = cv2.erode(np.uint8(lens.sees(color_camera)), np.ones((3, 3)))  # the rim mixes with black
+    covered = cv2.remap(covered, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
     known = inside & (depth > 0)
     cell = 2 * max(color_camera.fx / camera.fx, 0.5)  # pixels of the colour camera: wide enough to hold a reading each
     at = tuple(np.where(inside, np.maximum(pixels, 0) / cell, 0).astype(np.int32) for pixels in (rows, columns))
     nearest = np.full((int(height / cell) + 1, int(width / cell) + 1), np.inf, np.float32)
     np.minimum.at(nearest, (at[0][known], at[1][known]), z[known])
-    seen = known & (z <= (1 + HIDDEN) * cv2.erode(nearest, np.ones((3, 3)))[at])
-    return cv2.remap(color, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), seen
+    seen = known & (covered > 0) & (z <= (1 + HIDDEN) * cv2.erode(nearest, np.ones((3, 3)))[at])
+    undistorted = lens.undistort(color, color_camera)
+    return cv2.remap(undistorted, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), seen
 
 
 def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -20,12 +20,16 @@ INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tens
 MAX_SIDE = 8192  # pixels of a network's input
 
 
-def prepare(color: NDArray[np.uint8], scale: float, mean: Sequence[float], std: Sequence[float],
-            order: str) -> NDArray[np.float32]:
-    """Colours (H, W, 3) as 0..`scale`, less `mean`, by `std` (of the channels in the order given)."""
+def check_preparation(scale: float, mean: Sequence[float], std: Sequence[float], order: str) -> None:
+    """Raise InputError where these are not what `prepare` takes."""
     check_choice("order", order, ("rgb", "bgr"))
     if len(mean) != 3 or len(std) != 3 or not scale > 0 or not min(std) > 0:
         raise InputError(f"network: needs scale above 0, three means and three positive stds, got {scale}, {mean}, {std}")
+
+
+def prepare(color: NDArray[np.uint8], scale: float, mean: Sequence[float], std: Sequence[float],
+            order: str) -> NDArray[np.float32]:
+    """Colours (H, W, 3) as 0..`scale`, less `mean`, by `std` (of the channels in the order given)."""
     image = color if order == "rgb" else color[..., ::-1]
     return (image * np.float32(scale / 255) - np.float32(mean)) / np.float32(std)
 

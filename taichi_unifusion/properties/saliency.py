@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..types import Frame
 from .base import Look, SurfaceProperty, color_of
-from .networks import IMAGENET_MEAN, IMAGENET_STD, ImageNetwork, check_choice, prepare
+from .networks import IMAGENET_MEAN, IMAGENET_STD, ImageNetwork, check_choice, check_preparation, prepare
 
 LOOK = Look("viridis", (0.0, 1.0), "saliency")
 SPECTRUM_SIZE = 64     # pixels of the longer side: coarse, so that objects count and not their texture
@@ -60,6 +60,7 @@ def network_saliency(file: Path, *, size: tuple[int, int] | None = None, mean: t
     frame to [0, 1].
     """
     check_choice("activation", activation, ("none", "sigmoid", "minmax"))
+    check_preparation(scale, mean, std, order)
     network = ImageNetwork(file, size=size, output=output, channels=1, device=device, sha256=sha256)
 
     def function(frame: Frame) -> NDArray[np.float32]:

@@ -27,6 +27,7 @@ from ..maps.settings import PropertySettings
 from . import PROPERTIES
 from .base import SurfaceProperty
 
+NAME = re.compile(r"([^=,]*)(?:[=,](.*))?", re.DOTALL)
 OPTION = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)=(.*)", re.DOTALL)
 
 
@@ -36,7 +37,7 @@ def make_property(text: str, settings: PropertySettings | None = None) -> Surfac
     Raises InputError, with the right names, for an unknown property, method or option or a value that does not fit, and
     whatever making it raises: FileError for a model that is missing, MissingDependency for a package.
     """
-    name, _, rest = text.partition("=")
+    name, rest = NAME.fullmatch(text).groups(default="")
     methods = PROPERTIES.get(name)
     if methods is None:
         raise InputError(f"property '{name}' is unknown{_suggest(name, PROPERTIES)}; properties: {', '.join(PROPERTIES)}")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..types import Frame
 from .base import Look, SurfaceProperty, color_of
-from .networks import ImageNetwork, check_choice, prepare
+from .networks import ImageNetwork, check_preparation, prepare
 
 LOOK = Look(label="style")
 OVERSHOOT = 10.0  # times the stated range that an output may reach before the range must be wrong
@@ -55,7 +55,7 @@ def network_style(file: Path, *, size: tuple[int, int] | None = None, mean: tupl
     """
     if not output_scale > 0:
         raise InputError(f"style: output_scale must be positive, got {output_scale}")
-    check_choice("order", order, ("rgb", "bgr"))
+    check_preparation(scale, mean, std, order)
     network = ImageNetwork(file, size=size, output=output, channels=3, device=device, sha256=sha256)
 
     def function(frame: Frame) -> NDArray[np.float32]:
