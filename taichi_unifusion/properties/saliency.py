@@ -15,25 +15,26 @@ from .base import Look, SurfaceProperty, color_of
 from .networks import IMAGENET_MEAN, IMAGENET_STD, ImageNetwork, check_choice, check_preparation, prepare
 
 LOOK = Look("viridis", (0.0, 1.0), "saliency")
-SPECTRUM_SIZE = 64     # pixels of the longer side: coarse, so that objects count and not their texture
+PICTURE = 96           # pixels of the longer side: coarse, so that objects count and not their texture
 BLUR = 2.5             # [pixels] of that picture
 BRIGHTEST = 99.5       # percentile that becomes 1
 RANGE_SLACK = 0.01     # of a network that gives [0, 1], for rounding
 
 
-def spectral_saliency() -> SurfaceProperty:
-    """The simple one: what the spectral residual (Hou and Zhang 2007) of lightness and colour leaves; no weights, no learning.
+def signature_saliency() -> SurfaceProperty:
+    """The simple one: the image signature (Hou, Harel and Koch 2012) of lightness and colour; no weights, no learning.
 
-    It finds what differs from the picture's general texture; a salient-object network finds whole objects.
+    It finds what is small and differs from the picture's general texture; a salient-object network finds whole objects.
     """
 
     def function(frame: Frame) -> NDArray[np.float32]:
         color = color_of(frame)
         height, width = color.shape[:2]
-        scale = SPECTRUM_SIZE / max(height, width)
-        small = cv2.resize(color, (max(8, round(width * scale)), max(8, round(height * scale))), interpolation=cv2.INTER_AREA)
+        half = PICTURE / max(height, width) / 2
+        size = max(4, round(width * half)) * 2, max(4, round(height * half)) * 2  # even, as the transform needs it
+        small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
         lab = cv2.cvtColor(np.float32(small) / 255, cv2.COLOR_RGB2Lab)
-        salient = cv2.GaussianBlur(sum(spectral_residual(channel) for channel in cv2.split(lab)), None, BLUR)
+        salient = cv2.GaussianBlur(sum(signature_energy(channel) for channel in cv2.split(lab)), None, BLUR)
         salient -= salient.min()
         salient /= max(float(np.percentile(salient, BRIGHTEST)), 1e-12)
         return np.clip(cv2.resize(salient, (width, height), interpolation=cv2.INTER_CUBIC), 0, 1)
@@ -41,12 +42,9 @@ def spectral_saliency() -> SurfaceProperty:
     return SurfaceProperty("saliency", 1, function, LOOK)
 
 
-def spectral_residual(channel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Energy (H, W) of an image whose log spectrum is replaced by its difference to the local mean, phases kept."""
-    spectrum = np.fft.fft2(channel)
-    amplitude = np.log(np.abs(spectrum) + 1e-6)
-    residual = amplitude - cv2.blur(amplitude, (3, 3), borderType=cv2.BORDER_WRAP)
-    return np.float32(np.abs(np.fft.ifft2(np.exp(residual + 1j * np.angle(spectrum)))) ** 2)
+def signature_energy(channel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Energy (H, W) of what is left of an image when only the signs of its cosine transform are kept."""
+    return cv2.idct(np.sign(cv2.dct(channel))) ** 2
 
 
 def network_saliency(file: Path, *, size: tuple[int, int] | None = None, mean: tuple[float, ...] = IMAGENET_MEAN,

@@ -22,10 +22,12 @@ def painting_style(*, smoothness: float = 60.0, detail: float = 0.45) -> Surface
     """OpenCV's stylisation: flat, bright regions within dark contours; no weights. `smoothness` in pixels, `detail` in 0..1."""
 
     def function(frame: Frame) -> NDArray[np.float32]:
-        painted = cv2.stylization(_bgr_of(frame), sigma_s=_smoothness(smoothness), sigma_r=_detail(detail))
+        bgr = _bgr_of(frame)
+        grain = np.random.default_rng(0).integers(0, 2, bgr.shape, dtype=np.uint8)  # without it the filter makes flat areas black
+        painted = cv2.stylization(np.where(bgr < 128, bgr + grain, bgr - grain), sigma_s=smoothness, sigma_r=detail)
         return _as_rgb(painted)
 
-    _smoothness(smoothness), _detail(detail)
+    _check_filter(smoothness, detail)
     return SurfaceProperty("style", 3, function, LOOK)
 
 
@@ -36,11 +38,10 @@ def sketch_style(*, color: bool = False, smoothness: float = 60.0, detail: float
         raise InputError(f"style: shade must lie in 0..0.1, got {shade}")
 
     def function(frame: Frame) -> NDArray[np.float32]:
-        grey, colored = cv2.pencilSketch(_bgr_of(frame), sigma_s=_smoothness(smoothness), sigma_r=_detail(detail),
-                                         shade_factor=shade)
+        grey, colored = cv2.pencilSketch(_bgr_of(frame), sigma_s=smoothness, sigma_r=detail, shade_factor=shade)
         return _as_rgb(colored if color else cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
 
-    _smoothness(smoothness), _detail(detail)
+    _check_filter(smoothness, detail)
     return SurfaceProperty("style", 3, function, LOOK)
 
 
@@ -78,13 +79,8 @@ def _as_rgb(bgr: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.float32(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)) / 255
 
 
-def _smoothness(value: float) -> float:
-    if not 0 < value <= 200:
-        raise InputError(f"style: smoothness must lie above 0 and at most at 200 pixels, got {value}")
-    return value
-
-
-def _detail(value: float) -> float:
-    if not 0 < value <= 1:
-        raise InputError(f"style: detail must lie above 0 and at most at 1, got {value}")
-    return value
+def _check_filter(smoothness: float, detail: float) -> None:
+    if not 0 < smoothness <= 200:
+        raise InputError(f"style: smoothness must lie above 0 and at most at 200 pixels, got {smoothness}")
+    if not 0 < detail <= 1:
+        raise InputError(f"style: detail must lie above 0 and at most at 1, got {detail}")
