@@ -147,8 +147,21 @@ def _write_property(folder: ResultsFolder, mesh: Mesh, name: str, look: Look, pi
         folder.write(f"{name}.png", lambda path: write_property_picture(path, shown, name, look, run.trajectory))
 
 
+def property_meshes(directory: Path, mesh: Mesh) -> dict[Path, Mesh]:
+    """Mesh files of single properties that a results folder holds, and `mesh` in their colours, as its metrics tell them."""
+    try:
+        metrics = json.loads((directory / "metrics.json").read_text(encoding="utf-8"))
+        looks = {name: Look(shown["colormap"], shown["range"] and tuple(shown["range"]), shown["label"])
+                 for name, shown in metrics["properties"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # of an earlier version, or gone: colours of their own
+        looks = {}
+    return {directory / file: property_mesh(mesh, name, looks.get(name, Look(range=None)))
+            for name in mesh.attributes if name != "color"
+            for file in property_files(name)[:-1] if (directory / file).exists()}
+
+
 def property_files(name: str) -> tuple[str, ...]:
-    """Files of a property beside its map."""
+    """Files of a property beside its map; the picture is the last."""
     return (*(f"{name}{Path(file).suffix}" for file in MESH_FILES), f"{name}.png")
 
 

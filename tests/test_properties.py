@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import product
 
 import cv2
 import numpy as np
@@ -115,7 +116,7 @@ def test_saliency_of_nothing_is_a_number():
     assert np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1
 
 
-@pytest.mark.parametrize("text", ["style", "style=sketch", "style=sketch,color=true"])
+@pytest.mark.parametrize("text", ["style", "style=opencv", "style=sketch", "style=sketch,color=true"])
 def test_style_is_a_picture_and_leaves_a_flat_one_flat(noise, text):
     made = make_property(text)
     values = made.image(frame_of(noise))
@@ -129,8 +130,8 @@ def test_painting_keeps_a_colour_flat_or_not(noise, color):
     """Red stays red although OpenCV has blue first, and a flat area, such as a window that is too bright, is not black."""
     half = noise.copy()
     half[:, 60:] = color
-    for picture in (half, np.broadcast_to(np.uint8(color), noise.shape)):
-        values = make_property("style").image(frame_of(picture))
+    for picture, method in product((half, np.broadcast_to(np.uint8(color), noise.shape)), ("painting", "opencv")):
+        values = make_property(f"style={method}").image(frame_of(picture))
         assert np.abs(values[10:-10, 75:-5] - np.float32(color) / 255).max() < 5 / 255
 
 
@@ -225,7 +226,7 @@ def test_text_names_method_options_and_settings_of_the_map():
 @pytest.mark.parametrize(("text", "told"), [
     ("salience", "property 'salience' is unknown, did you mean 'saliency'\\?; properties: infrared, saliency"),
     ("", "property '' is unknown"),
-    ("style=skech", "method 'skech' is unknown, did you mean 'sketch'\\?; methods: painting, sketch, onnx"),
+    ("style=skech", "method 'skech' is unknown, did you mean 'sketch'\\?; methods: painting, opencv, sketch, onnx"),
     ("style=sketch,colour=true", "option 'colour' is unknown, did you mean 'color'\\?; options: .*voxel_size"),
     ("style=sketch,color=maybe", "color: expected true or false, got 'maybe'"),
     ("style=sketch,color=true,color=true", "'color=true' is given twice"),
@@ -233,6 +234,7 @@ def test_text_names_method_options_and_settings_of_the_map():
     ("style=sketch:x.onnx", "'style=sketch' takes no file"),
     ("style=sketch,shade=0.5", "shade must lie in 0..0.1, got 0.5"),
     ("style,smoothness=0", "smoothness must lie above 0"),
+    ("style,contours=-1", "contours must not be negative"),
     ("style,detail=2", "detail must lie above 0 and at most at 1, got 2"),
     ("saliency=onnx", "give the file, as in saliency=onnx:FILE"),
     ("images", "give the file, as in images=folder:FILE"),

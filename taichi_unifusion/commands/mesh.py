@@ -23,14 +23,14 @@ class ExtractMesh:
     """Cells along the edge of a surface voxel; 8 gives 4 times the triangles of 4."""
     min_area: Annotated[float, arg(metavar="M2")] = MeshSettings.min_area
     """Connected parts of less than this area, in square metres, are left out; 0 keeps all."""
-    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: DIR/mesh.ply and DIR/mesh.glb)")] = None
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: DIR/mesh.ply, DIR/mesh.glb, and those of properties)")] = None
     """Where to write it: .ply, .glb or .obj."""
     device: Literal["auto", "cuda", "cpu"] = "auto"
     """Where to compute."""
 
 
 def extract_mesh(options: ExtractMesh) -> int:
-    """Saved maps -> mesh files."""
+    """Saved maps -> mesh files, those of single properties included."""
     from ..io import MESH_SUFFIXES, check_writable, write_mesh
 
     files = [options.out] if options.out else [options.dir / "mesh.ply", options.dir / "mesh.glb"]
@@ -47,11 +47,16 @@ def extract_mesh(options: ExtractMesh) -> int:
     surface = SurfaceMap.load(maps.pop("surface"))
     properties = {name: PropertyMap.load(path) for name, path in maps.items()}
     mesh = pipeline.extract_mesh(surface, properties, options.resolution, options.min_area)
+    meshes = {file: mesh for file in files}
+    if not options.out:
+        from ..results import property_meshes
+
+        meshes.update(property_meshes(options.dir, mesh))
     failures = []
-    for file in files:
+    for file, shown in meshes.items():
         try:
-            write_mesh(file, mesh)
-            print(f"{file}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, "
+            write_mesh(file, shown)
+            print(f"{file}: {len(shown.vertices):,} vertices, {len(shown.faces):,} triangles, "
                   f"{format_bytes(file.stat().st_size)}")
         except UniFusionError as error:  # the other file may still be written
             failures.append(error)

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 PROPERTIES: dict[str, dict[str, tuple[str, str]]] = {  # name -> method -> module here, what makes it; the first is the default
     "infrared": {"log": ("infrared", "log_infrared"), "linear": ("infrared", "linear_infrared")},
     "saliency": {"signature": ("saliency", "signature_saliency"), "onnx": ("saliency", "network_saliency")},
-    "style": {"painting": ("style", "painting_style"), "sketch": ("style", "sketch_style"), "onnx": ("style", "network_style")},
+    "style": {"painting": ("style", "painting_style"), "opencv": ("style", "opencv_style"), "sketch": ("style", "sketch_style"),
+              "onnx": ("style", "network_style")},
     "images": {"folder": ("images", "folder_images")},
     "normal": {"depth": ("geometry", "surface_normal")},
     "curvature": {"depth": ("geometry", "mean_curvature")},

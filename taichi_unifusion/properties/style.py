@@ -15,11 +15,35 @@ from .base import Look, SurfaceProperty, color_of
 from .networks import ImageNetwork, check_preparation, prepare
 
 LOOK = Look(label="style")
+CONTOUR_WIDTH = 1.0  # [pixels]
+FAINTEST = 0.017     # change of brightness a pixel from which there is a contour
 OVERSHOOT = 10.0  # times the stated range that an output may reach before the range must be wrong
 
 
-def painting_style(*, smoothness: float = 60.0, detail: float = 0.45) -> SurfaceProperty:
-    """OpenCV's stylisation: flat, bright regions within dark contours; no weights. `smoothness` in pixels, `detail` in 0..1."""
+def painting_style(*, smoothness: float = 60.0, detail: float = 0.45, contours: float = 6.0) -> SurfaceProperty:
+    """Flat regions within dark contours, by OpenCV's edge-preserving filter; no weights.
+
+    `smoothness` in pixels, `detail` in 0..1, `contours` 0 for none. Every pixel depends on its surroundings only, not on the
+    frame's strongest edge, so that frames agree.
+    """
+    _check_filter(smoothness, detail)
+    if not contours >= 0:
+        raise InputError(f"style: contours must not be negative, got {contours}")
+
+    def function(frame: Frame) -> NDArray[np.float32]:
+        flat = cv2.edgePreservingFilter(color_of(frame), flags=cv2.RECURS_FILTER, sigma_s=smoothness, sigma_r=detail)
+        flat = np.float32(flat) / 255
+        soft = cv2.GaussianBlur(flat, None, CONTOUR_WIDTH)
+        slopes = (cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (0, 1))  # a pixel
+        strength = np.sqrt(sum(slope ** 2 for slope in slopes).max(axis=2, keepdims=True))
+        return flat * (1 - np.clip(contours * (strength - FAINTEST), 0, 1))
+
+    return SurfaceProperty("style", 3, function, LOOK)
+
+
+def opencv_style(*, smoothness: float = 60.0, detail: float = 0.45) -> SurfaceProperty:
+    """OpenCV's stylisation; no weights. Its contours are as strong as the frame's strongest edge allows: frames differ more."""
+    _check_filter(smoothness, detail)
 
     def function(frame: Frame) -> NDArray[np.float32]:
         bgr = _bgr_of(frame)
@@ -27,13 +51,13 @@ def painting_style(*, smoothness: float = 60.0, detail: float = 0.45) -> Surface
         painted = cv2.stylization(np.where(bgr < 128, bgr + grain, bgr - grain), sigma_s=smoothness, sigma_r=detail)
         return _as_rgb(painted)
 
-    _check_filter(smoothness, detail)
     return SurfaceProperty("style", 3, function, LOOK)
 
 
 def sketch_style(*, color: bool = False, smoothness: float = 60.0, detail: float = 0.07,
                  shade: float = 0.05) -> SurfaceProperty:
     """OpenCV's pencil drawing, grey or in `color`; no weights. `shade` in 0..0.1 makes it darker."""
+    _check_filter(smoothness, detail)
     if not 0 <= shade <= 0.1:
         raise InputError(f"style: shade must lie in 0..0.1, got {shade}")
 
@@ -41,7 +65,6 @@ def sketch_style(*, color: bool = False, smoothness: float = 60.0, detail: float
         grey, colored = cv2.pencilSketch(_bgr_of(frame), sigma_s=smoothness, sigma_r=detail, shade_factor=shade)
         return _as_rgb(colored if color else cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
 
-    _check_filter(smoothness, detail)
     return SurfaceProperty("style", 3, function, LOOK)
 
 
