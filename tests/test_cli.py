@@ -67,13 +67,14 @@ def files_in(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(("arguments", "code", "told"), [
-    (["--help"], 0, ["reconstruct", "mesh", "info", "config"]),
+    (["--help"], 0, ["reconstruct", "transfer", "mesh", "info", "config"]),
     (["--version"], 0, [f"unifusion {uf.__version__}"]),
-    (["reconstruct", "--help"], 0, ["FORMAT", "synthetic, 7scenes, replica, tum, scannet, folder", "--every",
+    (["reconstruct", "--help"], 0, ["FORMAT", "synthetic, 7scenes, replica, tum, scannet, k4a, folder", "--every",
                                     "unifusion config --help"]),
+    (["transfer", "--help"], 0, ["--property NAME[=SETTINGS]", "infrared, saliency, style, images, normal, curvature"]),
     (["config", "--help"], 0, ["--surface.voxel-size", "--preprocess.depth-max", "--mesh.resolution"]),
-    ([], 2, ["reconstruct, mesh, info, config"]),
-    (["reconstrukt"], 2, ["reconstruct, mesh, info, config"]),
+    ([], 2, ["reconstruct, transfer, mesh, info, config"]),
+    (["reconstrukt"], 2, ["reconstruct, transfer, mesh, info, config"]),
     (["reconstruct", "7scene", "x", "--out", "o"], 2, ["'7scene' is unknown, did you mean '7scenes'?", "scannet"]),
     (["reconstruct", "folder", "nowhere", "--out", "o"], 2, ["nowhere: no such file or folder"]),
     (["reconstruct", "synthetic"], 2, ["--out"]),
