@@ -14,6 +14,7 @@ from .config import Config
 from .errors import FrameError, InputError, PoseError, UniFusionError
 from .loading import load_ahead
 from .maps import PropertyMap, SurfaceMap
+from .maps.property_group import group_maps
 from .preprocessing import PreprocessSettings, preprocess
 from .properties import SurfaceProperty, make_property
 from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult, name_of
@@ -37,6 +38,7 @@ class Pipeline:
         self.properties = {"color": PropertyMap("color", 3, self.config.color),
                            **{name: PropertyMap(name, source.channels, source.settings or self.config.property_map)
                               for name, source in self.sources.items()}}
+        self.groups = group_maps(self.properties.values())
 
     @property
     def maps(self) -> dict[str, SurfaceMap | PropertyMap]:
@@ -59,11 +61,12 @@ class Pipeline:
             raise EmptyFrame(f"{name_of(frame)}: {_why_empty(frame, self.config.preprocess)}")
         with clock.stage("transform"):
             cloud = cloud.transformed(frame.T_world_camera)
-        integrations = {}
-        for name, target in self.maps.items():
-            if target is self.surface or name in cloud.attributes:
+        with clock.stage("surface"):
+            integrations = {"surface": self.surface.integrate(cloud)}
+        for group in self.groups:
+            if name := group.name_in(cloud):
                 with clock.stage(name):
-                    integrations[name] = target.integrate(cloud)
+                    integrations |= group.integrate(cloud)
         return StepResult(frame.index, frame.name, len(cloud), integrations, clock.milliseconds, lacking)
 
     def _with_properties(self, frame: Frame, clock: StageClock) -> tuple[Frame, dict[str, str]]:

@@ -36,6 +36,8 @@ def with_one_reading(frame):
 class StubMap:
     """Stands in for a map where a test is about the loop around it: keeps what it is given."""
 
+    name, settings = "color", None
+
     def __init__(self, *arguments) -> None:
         self.clouds = []
 

@@ -84,7 +84,8 @@ def test_fuse_equals_its_twin():
     old[old_weights == 0] = 0
     old_masks = rng.integers(0, 2**32, (60, 2), dtype=np.uint32)
     fused, fused_weights, fused_masks = old.copy(), old_weights.copy(), old_masks.copy()
-    fusion.fuse(rows, channels, 40, slots, latents, weights, masks, 1.0, fused, fused_weights, fused_masks)
+    beside = np.concatenate([np.full((40, rows, 3), 9, np.float32), latents], axis=2)  # another map's columns come first
+    fusion.fuse(rows, channels, 3, 40, slots, beside, weights, masks, 1.0, fused, fused_weights, fused_masks)
 
     def voxels(F, w, m, keys):
         return {int(k): reference.Voxel(F[n].astype(float), float(w[n]), m[n])

@@ -36,7 +36,7 @@ def cell_center(cell: ti.i32):
 def bin_points(
     # in:
     points: Floats2,   # (N, 3) world [m]
-    values: Floats2,   # (N, c)
+    values: Floats2,   # (N or more, c)
     per_meter: ti.f32,
     chunk: ti.i32,
     channels: ti.template(),
@@ -70,6 +70,20 @@ def bin_points(
                     total[channels + d] += (x[d] - at[d] - 0.5) / CELLS
         if run > 0:
             add_run(width, b, place, run, total, counts, sums)
+
+
+@ti.kernel
+def put_columns(
+    # in:
+    values: Floats2,   # (N, c)
+    channels: ti.template(),
+    first: ti.i32,
+    # out:
+    stacked: Floats2,  # (N or more, first + c or more)
+):
+    for n in range(values.shape[0]):
+        for c in ti.static(range(channels)):
+            stacked[n, first + c] = values[n, c]
 
 
 @ti.func

@@ -12,9 +12,10 @@ LEAST_WEIGHT = 0.5  # weights count points: less is what rounding leaves when al
 def fuse(
     # in:
     rows: ti.template(), channels: ti.template(),
+    first: ti.i32,            # column of `latents` that is the map's first
     voxels: ti.i32,
     slots: Ints1,             # (B,) slot in the map, -1 where none
-    latents: Floats3,         # (B, r, c) F'
+    latents: Floats3,         # (B, r, first + c or more) F'
     weights: Floats1,         # (B,) w'
     masks: Masks2,            # (B, 2) support
     sign: ti.f32,             # 1; -1 takes out again what was fused
@@ -33,7 +34,7 @@ def fuse(
                 share = new / total
             for a in range(rows):
                 old_row = ti.Vector([map_latents[s, a, c] for c in ti.static(range(channels))])  # all reads before all writes
-                new_row = ti.Vector([latents[v, a, c] for c in ti.static(range(channels))])
+                new_row = ti.Vector([latents[v, a, first + c] for c in ti.static(range(channels))])
                 fused = old_row + (new_row - old_row) * share
                 for c in ti.static(range(channels)):
                     map_latents[s, a, c] = fused[c]
@@ -42,13 +43,31 @@ def fuse(
                 map_masks[s, half] = map_masks[s, half] | masks[v, half]  # `|=` would be atomic
 
 
+@ti.func
+def encoded_place(q: ti.i32, size: ti.template(), channels: ti.template(), centered: ti.template(), first: ti.i32,
+                  encoded: ti.i32) -> ti.i32:
+    """Where number q of a map's sums stands in the sums of `encoded` channels of which the map has those from `first` on."""
+    targets = size * (size + 1) // 2
+    ones = targets + size * channels
+    means = ones + size * ti.static(int(centered))
+    place = q
+    if q >= means:
+        place += size * (encoded - channels) + first
+    elif q >= ones:
+        place += size * (encoded - channels)
+    elif q >= targets:
+        place += size * first
+    return place
+
+
 @ti.kernel
 def fuse_information(
     # in:
     rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
+    first: ti.i32, encoded: ti.i32,  # channel of the sums that is the map's first, and how many they have
     voxels: ti.i32,
     slots: Ints1,             # (B,) slot in the map, -1 where none
-    sums: Floats2,            # (B, q) as `keep_sums`
+    sums: Floats2,            # (B, q or more) as `keep_sums`
     weights: Floats1,         # (B,) w'
     masks: Masks2,            # (B, 2) support
     sign: ti.f32,             # 1; -1 takes out again what was fused
@@ -65,8 +84,8 @@ def fuse_information(
             G = ti.Vector([0.0] * (rows * size))
             mean = ti.Vector([0.0] * channels)
             total = map_weights[s] + sign * weights[v]
-            for q in range(sums.shape[1]):
-                map_sums[s, q] = map_sums[s, q] + sign * sums[v, q]
+            for q in range(map_sums.shape[1]):
+                map_sums[s, q] = map_sums[s, q] + sign * sums[v, encoded_place(q, size, channels, centered, first, encoded)]
             k = 0
             for i in range(size):
                 for j in range(i + 1):

@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .base_map import BaseMap, Integration
+    from .property_group import PropertyGroup
     from .property_map import PropertyMap
     from .settings import MapSettings, PropertySettings, SurfaceSettings
     from .surface_map import SurfaceMap
 
-__all__ = ["BaseMap", "Integration", "MapSettings", "PropertyMap", "PropertySettings", "SurfaceMap", "SurfaceSettings",
-           "load_map"]
+__all__ = ["BaseMap", "Integration", "MapSettings", "PropertyGroup", "PropertyMap", "PropertySettings", "SurfaceMap",
+           "SurfaceSettings", "load_map"]
 
-_MODULES = {"BaseMap": "base_map", "Integration": "base_map", "PropertyMap": "property_map", "SurfaceMap": "surface_map",
+_MODULES = {"BaseMap": "base_map", "Integration": "base_map", "PropertyMap": "property_map",
+            "PropertyGroup": "property_group", "SurfaceMap": "surface_map",
             "MapSettings": "settings", "PropertySettings": "settings", "SurfaceSettings": "settings"}
 
 

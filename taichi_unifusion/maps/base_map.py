@@ -110,15 +110,16 @@ class BaseMap(ABC):
     def _encode_points(self, cloud: PointCloud) -> FrameBlocks:
         """Encode from every point; returns as `_encode_cells`."""
 
-    def _encode_samples(self, blocks: FrameBlocks, samples: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
+    def _encode_samples(self, blocks: FrameBlocks, regressor: Regressor, samples: NDArray[np.float32],
+                        targets: NDArray[np.float32]) -> None:
         """Encode samples (N, 3) world [m] with targets (N, c), each as it is, after touching their voxels."""
         blocks.touch(samples, self.voxel_size, spread=True)
         block_of = np.empty(len(samples), np.int32)
         voxels.block_of_points(samples, 1.0 / self.voxel_size, self._grid.block, block_of)
         order = np.argsort(block_of, kind="stable")
         starts = np.searchsorted(block_of[order], np.arange(blocks.count + 1)).astype(np.int32)
-        self._regressor.encode_points(blocks, starts, samples[order] / np.float32(self.voxel_size),
-                                      np.ascontiguousarray(targets[order], dtype=np.float32))
+        regressor.encode_points(blocks, starts, samples[order] / np.float32(self.voxel_size),
+                                np.ascontiguousarray(targets[order], dtype=np.float32))
 
     def merge(self, other: BaseMap) -> None:
         """Fuse another map of the same settings into this one (Eq. 19 is associative); raises InputError where they differ."""

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..types import PointCloud
 from .base_map import BaseMap
 from .frame_blocks import FrameBlocks
+from .regressor import Regressor
 from .settings import PropertySettings
 
 NEAREST_REACH = 2  # voxels
@@ -51,16 +52,28 @@ class PropertyMap(BaseMap):
         return values
 
     def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
-        self._cells.touch(cloud.points, self.voxel_size)
-        self._cells.bin(cloud.points, cloud.attributes[self.name], self.voxel_size)
-        self._cells.compact(1)
-        self._regressor.encode_cells(self._cells)
+        self._encode_values(self._cells, self._regressor, cloud.points, cloud.attributes[self.name])
         return self._cells
 
-    def _encode_points(self, cloud: PointCloud) -> FrameBlocks:
-        self._encode_samples(self._cells, cloud.points, cloud.attributes[self.name])
-        self._cells.bin_support(cloud.points, self.voxel_size, 1)
-        return self._cells
+    _encode_points = _encode_cells
+
+    def _encode_values(self, blocks: FrameBlocks, regressor: Regressor, points: NDArray[np.float32],
+                       values: NDArray[np.float32]) -> None:
+        """Encode values (N, c) at points (N, 3) world [m], from cell averages or each as it is."""
+        if self.settings.sampling == "cells":
+            blocks.touch(points, self.voxel_size)
+            blocks.bin(points, values, self.voxel_size)
+            blocks.compact(1)
+            regressor.encode_cells(blocks)
+        else:
+            self._encode_samples(blocks, regressor, points, values)
+            blocks.bin_support(points, self.voxel_size, 1)
+
+    def _make_encoder(self, channels: int) -> tuple[FrameBlocks, Regressor]:
+        """Scratch to encode `channels` values a point as this map encodes its own."""
+        centered = self.settings.prior == "mean"
+        return (FrameBlocks(self._grid, channels, with_positions=False),
+                Regressor(self._grid, self.settings, channels=channels, centered=centered, derivatives=False))
 
     def query(self, points: NDArray, return_valid: bool = False):
         """Property values (N, c) float32 at points (N, 3) world [m]; optionally also where (N,) a voxel covers the point.

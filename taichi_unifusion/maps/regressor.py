@@ -47,7 +47,8 @@ class Regressor:
         self.latents = ti.ndarray(ti.f32, (1, 1, 1))
         self.weights = ti.ndarray(ti.f32, (1,))
         self.slots = ti.ndarray(ti.i32, (1,))
-        self.sums = ti.ndarray(ti.f32, (1, max(grid.sum_count, 1)))
+        self.sum_count = sum_count(self.rank, channels, centered) if self.information else 1
+        self.sums = ti.ndarray(ti.f32, (1, self.sum_count))
 
     def _shared_tiles(self):
         """Scratch for the workers, one for all maps of a runtime; a field, because its strides are known when compiling."""
@@ -78,7 +79,7 @@ class Regressor:
             room = blocks.count * 5 // 4
             self.neighbors = ti.ndarray(ti.i32, (room, 27))
             if self.information:
-                self.sums = ti.ndarray(ti.f32, (room, self.grid.sum_count))
+                self.sums = ti.ndarray(ti.f32, (room, self.sum_count))
             else:
                 self.latents = ti.ndarray(ti.f32, (room, self.grid.rows, self.channels))
             self.weights = ti.ndarray(ti.f32, (room,))
@@ -113,10 +114,15 @@ class Regressor:
                                self.grid.latents, self.anchors, self.projection, self.scale, reach, values, valid)
         return values, valid.astype(bool)
 
-    def fuse(self, blocks: FrameBlocks) -> int:
-        """Fuse what was encoded into the map, with the blocks' support; returns the number of voxels encoded."""
-        encoded = self.grid.claim(blocks.count, blocks.keys, self.weights, self.slots)
-        self.fuse_rows(blocks.count, self.slots, self.latents, self.sums, self.weights, blocks.support, 1.0)
+    def fuse(self, blocks: FrameBlocks, encoder: Regressor | None = None, first: int = 0) -> int:
+        """Fuse what was encoded into the map, with the blocks' support; returns the number of voxels encoded.
+
+        With an `encoder`, that which it encoded, of its channels those from `first` on.
+        """
+        source = encoder or self
+        encoded = self.grid.claim(blocks.count, blocks.keys, source.weights, source.slots)
+        self.fuse_rows(blocks.count, source.slots, source.latents, source.sums, source.weights, blocks.support, 1.0, first,
+                       source.channels)
         return encoded
 
     def take_out(self, blocks: FrameBlocks) -> int:
@@ -131,14 +137,18 @@ class Regressor:
         blocks.support.fill(0)
         return blocks.support
 
-    def fuse_rows(self, count: int, slots, latents, sums, weights, masks, sign: float) -> None:
-        """Fuse `count` voxels into the slots of the map: by Eq. 19, or as sums of one regression over all frames."""
+    def fuse_rows(self, count: int, slots, latents, sums, weights, masks, sign: float, first: int = 0,
+                  encoded: int | None = None) -> None:
+        """Fuse `count` voxels into the slots of the map: by Eq. 19, or as sums of one regression over all frames.
+
+        The rows may hold `encoded` channels, of which the map's are those from `first` on.
+        """
         if self.information:
-            fusion.fuse_information(self.rank, self.size, self.rows, self.channels, self.centered, count, slots, sums, weights,
-                                    masks, sign, self.noise, self.grid.sums, self.grid.latents, self.grid.weights,
-                                    self.grid.masks)
+            fusion.fuse_information(self.rank, self.size, self.rows, self.channels, self.centered, first,
+                                    encoded or self.channels, count, slots, sums, weights, masks, sign, self.noise,
+                                    self.grid.sums, self.grid.latents, self.grid.weights, self.grid.masks)
         else:
-            fusion.fuse(self.grid.rows, self.channels, count, slots, latents, weights, masks, sign, self.grid.latents,
+            fusion.fuse(self.grid.rows, self.channels, first, count, slots, latents, weights, masks, sign, self.grid.latents,
                         self.grid.weights, self.grid.masks)
 
 

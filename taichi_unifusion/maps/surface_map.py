@@ -70,7 +70,7 @@ class SurfaceMap(BaseMap):
         samples = np.tile(cloud.points, (len(self._steps), 1)) + steps * np.float32(self.voxel_size) * np.tile(
             cloud.normals, (len(self._steps), 1))
         targets = np.hstack([steps, np.tile(cloud.normals, (len(self._steps), 1))]) if self._regressor.derivatives else steps
-        self._encode_samples(self._samples, samples, targets)
+        self._encode_samples(self._samples, self._regressor, samples, targets)
         self._samples.bin_support(samples, self.voxel_size, self.settings.support_points)
         return self._samples
 

@@ -1,0 +1,108 @@
+"""Properties that share one encoding: every map is as if it had been fused alone."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scenes import cloud_of, rough
+
+from taichi_unifusion import PointCloud, PropertyMap, load_map
+from taichi_unifusion.errors import CapacityError, InputError
+from taichi_unifusion.kernels.cells import put_columns
+from taichi_unifusion.maps import PropertyGroup
+from taichi_unifusion.maps.property_group import group_maps
+
+SAME = 2e-5  # relative to values of the size of 3: another width of the right side may be summed in another order
+CHANNELS = {"one": 1, "rgb": 3, "five": 5}
+SETTINGS = [{"sampling": sampling, "prior": prior, "blend": prior == "mean", "voxel_size": 0.05}
+            for sampling, prior in product(("cells", "points"), ("mean", "zero"))]
+
+
+def maps_of(**settings) -> list[PropertyMap]:
+    return [PropertyMap(name, channels, **settings) for name, channels in CHANNELS.items()]
+
+
+def without(cloud: PointCloud, name: str) -> PointCloud:
+    return cloud_of(cloud.points, cloud.normals, **{key: v for key, v in cloud.attributes.items() if key != name})
+
+
+def with_holes(cloud: PointCloud, name: str) -> PointCloud:
+    cloud.attributes[name][::3] = np.nan
+    return cloud
+
+
+def assert_same(found: PropertyMap, wanted: PropertyMap) -> None:
+    a, b = found._grid.export(), wanted._grid.export()
+    for part in ("keys", "weights", "masks"):
+        np.testing.assert_array_equal(getattr(a, part), getattr(b, part))
+    np.testing.assert_allclose(a.latents, b.latents, rtol=0, atol=3 * SAME)
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: f"{s['sampling']}-{s['prior']}")
+def test_each_map_is_as_if_it_were_alone(settings):
+    """Also where a frame lacks a property, or has values that are no numbers in one of them."""
+    frames = [rough(1), without(rough(2), "rgb"), with_holes(rough(3), "five"), rough(4, count=5000)]
+    group, alone = PropertyGroup(maps_of(**settings)), maps_of(**settings)
+    for cloud in frames:
+        done = group.integrate(cloud)
+        for each in alone:
+            if each.name in cloud.attributes:
+                assert each.integrate(cloud) == done.pop(each.name)
+        assert not done
+    for found, wanted in zip(group.maps, alone, strict=True):
+        assert_same(found, wanted)
+
+
+def test_maps_of_a_group_are_saved_loaded_and_merged_alone(tmp_path):
+    first, second = PropertyGroup(maps_of(voxel_size=0.05)), PropertyGroup(maps_of(voxel_size=0.05))
+    both = PropertyGroup(maps_of(voxel_size=0.05))
+    first.integrate(rough(1))
+    second.integrate(rough(2))
+    both.integrate(rough(1))
+    both.integrate(rough(2))
+    for a, b, wanted in zip(first.maps, second.maps, both.maps, strict=True):
+        a.save(tmp_path / "map.safetensors")
+        loaded = load_map(tmp_path / "map.safetensors")
+        assert loaded.name == a.name and loaded.channels == a.channels
+        points = rough(1).points
+        np.testing.assert_array_equal(loaded.query(points), a.query(points))
+        loaded.merge(b)
+        assert_same(loaded, wanted)
+        del loaded
+
+
+def test_maps_are_grouped_by_their_settings():
+    maps = [PropertyMap("one", 1, voxel_size=0.1), PropertyMap("rgb", 3, voxel_size=0.02), PropertyMap("five", 5, voxel_size=0.1)]
+    groups = group_maps(maps)
+    assert [[each.name for each in group.maps] for group in groups] == [["one", "five"], ["rgb"]]
+    assert groups[0].name_in(rough(1)) == "one + five" and groups[0].name_in(without(rough(1), "one")) == "five"
+    with pytest.raises(InputError, match="property group: 'one' and 'rgb' have other settings"):
+        PropertyGroup(maps[:2])
+    empty = cloud_of(np.empty((0, 3)), np.empty((0, 3)), one=np.empty((0, 1)), five=np.empty((0, 5)))
+    assert all(done.total_voxels == 0 for done in groups[0].integrate(empty).values())
+
+
+def test_no_map_changes_where_one_of_them_is_full(monkeypatch):
+    group = PropertyGroup(maps_of(voxel_size=0.05))
+    group.integrate(rough(1))
+    before = [each._grid.export() for each in group.maps]
+
+    def full(extra):
+        raise CapacityError("full")
+
+    monkeypatch.setattr(group.maps[2]._grid, "reserve", full)
+    with pytest.raises(CapacityError):
+        group.integrate(rough(2))
+    for each, old in zip(group.maps, before, strict=True):
+        np.testing.assert_array_equal(each._grid.export().latents, old.latents)
+
+
+def test_put_columns_equals_its_twin():
+    rng = np.random.default_rng(0)
+    values, stacked = rng.normal(size=(50, 3)).astype(np.float32), rng.normal(size=(60, 7)).astype(np.float32)
+    twin = stacked.copy()
+    twin[:50, 2:5] = values
+    put_columns(values, 3, 2, stacked)
+    np.testing.assert_array_equal(stacked, twin)
