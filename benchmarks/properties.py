@@ -1,0 +1,144 @@
+"""Properties: what a frame costs each map, what a second property adds, and how well images come back.
+
+    python benchmarks/properties.py cost                    # 1280x720 frames of the synthetic room, as in the paper's Table VIII
+    python benchmarks/properties.py sharing                 # the time that a second property of three channels adds
+    python benchmarks/properties.py quality synthetic       # PSNR at held-out frames: colour, infrared-like, styles
+    python benchmarks/properties.py quality house PATH      # the same in the flat of aws-robomaker-small-house-world
+
+Times are of this process's processors (CPU seconds by threads in use), because other programs share the machine; on a GPU, of
+the clock. Frames are loaded and property images made before; every map takes its turn at every frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import taichi_unifusion as uf
+from taichi_unifusion import runtime
+from taichi_unifusion.maps import PropertyGroup
+from taichi_unifusion.properties import SurfaceProperty, make_property
+
+PAPER_MS = {"surface": 100, "color": 38, "infrared": 45, "style": 48, "saliency": 45}  # Table VIII, a GPU, 1280x720
+
+
+def like_infrared(frame: uf.Frame) -> np.ndarray:
+    """Mean colour in units of 0..65535: of what an infrared camera gives, the part that a rendered scene has."""
+    return np.float32(frame.color).mean(axis=2) * 257
+
+
+def with_images(frame: uf.Frame, properties: Sequence[SurfaceProperty]) -> uf.Frame:
+    frame = made = frame.with_image("infrared", like_infrared(frame))
+    for each in properties:
+        made = made.with_image(each.name, each.image(frame))
+    return made
+
+
+def cloud_of(frame: uf.Frame) -> uf.PointCloud:
+    return uf.preprocess(frame).transformed(frame.T_world_camera)
+
+
+def timed(work: Callable, *arguments) -> float:
+    """Milliseconds: of all threads' processor time on the CPU, of the clock on a GPU."""
+    clock = time.process_time if runtime.current().device == "cpu" else time.perf_counter
+    runtime.synchronize()
+    start = clock()
+    work(*arguments)
+    runtime.synchronize()
+    return 1e3 * (clock() - start)
+
+
+def cost(frames: int) -> None:
+    """A table of milliseconds a frame by map."""
+    properties = [make_property(name) for name in ("infrared", "style", "saliency")]
+    room = uf.open_dataset("synthetic", frames=60, width=1280, height=720)
+    clouds = [cloud_of(with_images(room[i], properties)) for i in range(frames)]
+    maps = {"surface": uf.SurfaceMap(), "color": uf.PropertyMap("color", 3),
+            **{each.name: uf.PropertyMap(each.name, each.channels, each.settings) for each in properties}}
+    group = PropertyGroup([uf.PropertyMap(each.name, each.channels, each.settings) for each in properties])
+    laps: dict[str, list[float]] = {}
+    for cloud in clouds:
+        for name, target in maps.items():
+            laps.setdefault(name, []).append(timed(target.integrate, cloud))
+        laps.setdefault("infrared + style + saliency", []).append(timed(group.integrate, cloud))
+    sizes = {name: f"{100 * target.voxel_size:g} cm" for name, target in maps.items()}
+    table = Table(title=f"{len(clouds[0]):,} points a frame of 1280x720, {runtime.current().description}")
+    for column in ("map", "voxels", "ms a frame", "paper, ms"):
+        table.add_column(column, justify="left" if column == "map" else "right")
+    for name, values in laps.items():
+        table.add_row(name, sizes.get(name, "10 cm"), f"{np.median(values[2:]):.1f}",
+                      str(PAPER_MS.get(name, sum(PAPER_MS[each.name] for each in properties))))
+    Console().print(table)
+
+
+def sharing(frames: int) -> None:
+    """The time of a frame for one property of three channels, and for two of them."""
+    room = uf.open_dataset("synthetic", frames=60)
+    clouds = []
+    for i in range(frames):
+        frame = room[i]
+        image = np.float32(frame.color) / 255
+        clouds.append(cloud_of(frame.with_image("first", image).with_image("second", image[..., ::-1])))
+    for voxel_size in (0.1, 0.05, 0.02):
+        groups = [PropertyGroup([uf.PropertyMap(name, 3, voxel_size=voxel_size) for name in names])
+                  for names in (["first"], ["first", "second"])]
+        laps = np.array([[timed(group.integrate, cloud) for group in groups] for _ in range(3) for cloud in clouds])[len(clouds):]
+        one, two = np.median(laps, axis=0)
+        print(f"{100 * voxel_size:g} cm voxels: one property {one:.1f} ms a frame, two {two:.1f} ms, the second adds "
+              f"{100 * np.median((laps[:, 1] - laps[:, 0]) / laps[:, 0]):.0f} %", flush=True)
+        del groups
+
+
+def quality(scene: str, path: str | None, voxel_sizes: Sequence[float]) -> None:
+    """PSNR [dB] of every property at the points of frames that were not mapped, by voxel size."""
+    if scene == "house":
+        from house import load_house
+
+        recording = load_house(path, "living", noise=True)[:120:6]
+    else:
+        recording = uf.open_dataset("synthetic", frames=60)[:20]
+    properties = [make_property(text) for text in (
+        "infrared=linear,name=infrared", "style,name=painting", "style=opencv,name=opencv", "style=sketch,name=sketch")]
+    frames = [cloud_of(with_images(recording[i], properties)) for i in range(len(recording))]
+    held_out = frames[2::4]
+    for voxel_size in voxel_sizes:
+        maps = [uf.PropertyMap("color", 3, voxel_size=voxel_size)]
+        maps += [uf.PropertyMap(each.name, each.channels, voxel_size=voxel_size) for each in properties]
+        group = PropertyGroup(maps)
+        for i, cloud in enumerate(frames):
+            if i % 4 != 2:
+                group.integrate(cloud)
+        found = {}
+        for each in maps:
+            squares = []
+            for cloud in held_out:
+                values, valid = each.query(cloud.points, return_valid=True)
+                squares.append(np.square(values - cloud.attributes[each.name])[valid].mean())
+            found[each.name] = np.mean(-10 * np.log10(squares))
+        print(f"{scene}, {100 * voxel_size:g} cm: " + ", ".join(f"{name} {value:.2f} dB" for name, value in found.items()), flush=True)
+        del maps, group
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("cost", "sharing", "quality"))
+    parser.add_argument("scene", nargs="?", choices=("synthetic", "house"), default="synthetic")
+    parser.add_argument("path", nargs="?", help="folder of the house's GLB")
+    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--voxel-sizes", type=float, nargs="+", default=(0.02, 0.05, 0.1))
+    parser.add_argument("--device", default="auto")
+    options = parser.parse_args()
+    uf.init(options.device)
+    if options.what == "quality":
+        quality(options.scene, options.path, options.voxel_sizes)
+    else:
+        {"cost": cost, "sharing": sharing}[options.what](options.frames)
+
+
+if __name__ == "__main__":
+    main()
