@@ -8,13 +8,14 @@ from scenes import cloud_of, rough
 
 from taichi_unifusion import PointCloud, PropertyMap, load_map
 from taichi_unifusion.errors import CapacityError, InputError
-from taichi_unifusion.kernels.cells import put_columns
 from taichi_unifusion.maps import PropertyGroup
+from taichi_unifusion.maps.frame_blocks import FrameBlocks
 from taichi_unifusion.maps.property_group import group_maps
 
 SAME = 2e-5  # relative to values of the size of 3: another width of the right side may be summed in another order
 CHANNELS = {"one": 1, "rgb": 3}
 SETTINGS = [{"sampling": "cells", "prior": "mean", "voxel_size": 0.05},
+            {"sampling": "cells", "prior": "mean", "voxel_size": 0.05, "fusion": "information"},
             {"sampling": "points", "prior": "zero", "blend": False, "voxel_size": 0.05}]
 
 
@@ -38,7 +39,7 @@ def assert_same(found: PropertyMap, wanted: PropertyMap) -> None:
     np.testing.assert_allclose(a.latents, b.latents, rtol=0, atol=3 * SAME)
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: s["sampling"])
+@pytest.mark.parametrize("settings", SETTINGS, ids=lambda s: "-".join(map(str, s.values())))
 def test_each_map_is_as_if_it_were_alone(settings):
     """Also where a frame lacks a property, or has values that are no numbers in one of them."""
     frames = [rough(1), without(rough(2), "rgb"), with_holes(rough(3), "rgb"), rough(4, count=5000)]
@@ -97,10 +98,22 @@ def test_no_map_changes_where_one_of_them_is_full(monkeypatch):
         np.testing.assert_array_equal(each._grid.export().latents, old.latents)
 
 
-def test_put_columns_equals_its_twin():
-    rng = np.random.default_rng(0)
-    values, stacked = rng.normal(size=(50, 3)).astype(np.float32), rng.normal(size=(60, 7)).astype(np.float32)
-    twin = stacked.copy()
-    twin[:50, 2:5] = values
-    put_columns(values, 3, 2, stacked)
-    np.testing.assert_array_equal(stacked, twin)
+@pytest.mark.parametrize("parts", [2, 5])
+def test_values_are_summed_in_cells_to_the_bit_as_one_array_is(parts):
+    """bin_together is bin_points on the arrays side by side, whose twin is in reference.py."""
+    cloud = rough(6, count=3000)
+    grid = PropertyMap("rgb", 3, voxel_size=0.05)._grid
+    values = [cloud.attributes["rgb"], *[cloud.attributes["one"] * n for n in range(1, parts)]]
+    sums = []
+    for together in (False, True):
+        blocks = FrameBlocks(grid, 2 + parts, with_positions=False)
+        blocks.touch(cloud.points, 0.05)
+        if together:
+            blocks.bin_together(cloud.points, values, 0.05)
+        else:
+            blocks.bin(cloud.points, np.hstack(values), 0.05)
+        order = np.lexsort(blocks.keys.to_numpy()[:blocks.count].T)  # blocks are numbered as threads come
+        sums.append([array.to_numpy()[:blocks.count][order] for array in (blocks.counts, blocks.sums)])
+    assert sums[0][0].sum() == len(cloud)
+    for one, together in zip(*sums, strict=True):
+        np.testing.assert_array_equal(one, together)

@@ -36,7 +36,7 @@ def cell_center(cell: ti.i32):
 def bin_points(
     # in:
     points: Floats2,   # (N, 3) world [m]
-    values: Floats2,   # (N or more, c)
+    values: Floats2,   # (N, c)
     per_meter: ti.f32,
     chunk: ti.i32,
     channels: ti.template(),
@@ -73,17 +73,44 @@ def bin_points(
 
 
 @ti.kernel
-def put_columns(
+def bin_together(
     # in:
-    values: Floats2,   # (N, c)
-    channels: ti.template(),
-    first: ti.i32,
+    points: Floats2,   # (N, 3) world [m]
+    values_0: Floats2, values_1: Floats2, values_2: Floats2, values_3: Floats2,  # (N, c_i); (1, 1) where c_i is 0
+    channels: ti.template(),  # c_i of the four
+    per_meter: ti.f32,
+    chunk: ti.i32,
+    block: ti.template(),
     # out:
-    stacked: Floats2,  # (N or more, first + c or more)
+    counts: Ints2,     # (B, 64) += points in the cell
+    sums: Sums3,       # (B, 64, sum of c_i) += values side by side, as `bin_points` sums one array
 ):
-    for n in range(values.shape[0]):
-        for c in ti.static(range(channels)):
-            stacked[n, first + c] = values[n, c]
+    for part in range((points.shape[0] + chunk - 1) // chunk):
+        width = ti.static(sum(channels))
+        place = ti.Vector([INDEX_HALF * CELLS, 0, 0])  # of the cell in the lattice of all cells
+        b, run = -1, 0
+        total = ti.Vector([0.0] * width)
+        for n in range(part * chunk, ti.min((part + 1) * chunk, points.shape[0])):
+            at = ti.floor(row3(points, n) * (per_meter * CELLS), ti.i32)
+            if any(at != place):
+                if run > 0:
+                    add_run(width, b, place, run, total, counts, sums)
+                if any((at >> 2) != (place >> 2)):
+                    b = block[(at >> 2) + INDEX_HALF]
+                place = at
+                run = 0
+                total.fill(0.0)
+            run += 1
+            for c in ti.static(range(channels[0])):
+                total[c] += values_0[n, c]
+            for c in ti.static(range(channels[1])):
+                total[channels[0] + c] += values_1[n, c]
+            for c in ti.static(range(channels[2])):
+                total[channels[0] + channels[1] + c] += values_2[n, c]
+            for c in ti.static(range(channels[3])):
+                total[channels[0] + channels[1] + channels[2] + c] += values_3[n, c]
+        if run > 0:
+            add_run(width, b, place, run, total, counts, sums)
 
 
 @ti.func

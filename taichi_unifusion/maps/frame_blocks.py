@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from ..kernels import cells as kernels
 from ..kernels.voxels import BLOCK_CELLS, INDEX_HALF, touch_points
 from .voxel_grid import VoxelGrid
 
+TOGETHER = 4    # arrays of values that the kernel takes
 CPU_CHUNK = 32  # consecutive points a thread takes: long enough for runs in one cell, short enough to balance
 
 
@@ -62,6 +65,15 @@ class FrameBlocks:
         """Sum points, values and positions into the cells of the touched blocks."""
         kernels.bin_points(points, values, 1.0 / voxel_size, self.chunk, self.channels, self.with_positions, self.grid.block,
                            self.counts, self.sums)
+
+    def bin_together(self, points: NDArray[np.float32], values: Sequence[NDArray[np.float32]], voxel_size: float) -> None:
+        """Sum several arrays of values, side by side, as `bin` sums one; every point's cell is found once."""
+        if len(values) > TOGETHER:
+            values = [*values[:TOGETHER - 1], np.hstack(values[TOGETHER - 1:])]
+        nothing = [np.zeros((1, 1), np.float32)] * (TOGETHER - len(values))
+        channels = tuple(array.shape[1] for array in values) + (0,) * len(nothing)
+        kernels.bin_together(points, *values, *nothing, channels, 1.0 / voxel_size, self.chunk, self.grid.block, self.counts,
+                             self.sums)
 
     def touch_samples(self, offsets: NDArray[np.float32]) -> bool:
         """Also give numbers to the voxels of the samples beside the surfels; False where room had to be made: begin again."""

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 
 from .. import runtime
 from ..errors import InputError
-from ..kernels.cells import put_columns
 from ..types import PointCloud
 from .base_map import Integration
 from .frame_blocks import FrameBlocks
@@ -36,7 +33,7 @@ class PropertyGroup:
             if other.settings != first.settings:
                 raise InputError(f"property group: '{first.name}' and '{other.name}' have other settings: {first.settings} and "
                                  f"{other.settings}")
-        self._scratch: dict[int, _Scratch] = {}  # by channels in all
+        self._encoders: dict[int, tuple[FrameBlocks, Regressor]] = {}  # by channels in all
 
     def name_in(self, cloud: PointCloud) -> str:
         """The names of the maps whose attribute a cloud has."""
@@ -48,49 +45,26 @@ class PropertyGroup:
         Each map is as after an `integrate` of its own; raises as that does, with all maps unchanged.
         """
         present = [each for each in self.maps if each.name in cloud.attributes]
-        whole = [each for each in present if len(present) > 1 and np.isfinite(each._observed(cloud).sum())]  # no point is left out
-        if len(whole) < 2 or not len(cloud):  # nothing to share
+        finite = [each for each in present if len(present) > 1 and np.isfinite(each._observed(cloud).sum())]
+        if len(finite) < 2 or not len(cloud):  # nothing to share; a map whose values are not all finite leaves points out
             return {each.name: each.integrate(cloud) for each in present}
-        runtime.check_alive(whole[0]._grid.runtime)
-        scratch = self._scratch_for(whole, len(cloud))
-        blocks, regressor = scratch.blocks, scratch.regressor
-        whole[0]._encode_values(blocks, regressor, cloud.points, self._stacked(scratch, whole, cloud))
-        for each in whole:
+        runtime.check_alive(finite[0]._grid.runtime)
+        blocks, regressor = self._encoder(finite)
+        finite[0]._encode_values(blocks, regressor, cloud.points, [cloud.attributes[each.name] for each in finite])
+        for each in finite:
             each._grid.reserve(blocks.count)  # what does not fit is said before the first of them changes
         done, first = {}, 0
-        for each in whole:
+        for each in finite:
             done[each.name] = Integration(len(cloud), each._regressor.fuse(blocks, regressor, first), len(each))
             first += each.channels
-        return done | {each.name: each.integrate(cloud) for each in present if each not in whole}
+        return done | {each.name: each.integrate(cloud) for each in present if each not in finite}
 
-    def _scratch_for(self, maps: Sequence[PropertyMap], points: int) -> _Scratch:
-        """Scratch for the properties of one frame; the first map's index says which voxel is which block."""
+    def _encoder(self, maps: Sequence[PropertyMap]) -> tuple[FrameBlocks, Regressor]:
+        """Scratch for the properties of a frame; the first map's index says which voxel is which block."""
         channels = sum(each.channels for each in maps)
-        scratch = self._scratch.get(channels)
-        if scratch is None or scratch.blocks.grid is not maps[0]._grid:
-            scratch = self._scratch[channels] = _Scratch(*maps[0]._make_encoder(channels), ti.ndarray(ti.f32, (1, channels)))
-        if points > scratch.values.shape[0]:
-            scratch.values = ti.ndarray(ti.f32, (points * 5 // 4, channels))
-        return scratch
-
-    def _stacked(self, scratch: _Scratch, maps: Sequence[PropertyMap], cloud: PointCloud):
-        """The values of all maps side by side; as an array of the host where single samples are sorted there."""
-        if maps[0].settings.sampling == "points":
-            return np.hstack([cloud.attributes[each.name] for each in maps])
-        first = 0
-        for each in maps:
-            put_columns(cloud.attributes[each.name], each.channels, first, scratch.values)
-            first += each.channels
-        return scratch.values
-
-
-@dataclass
-class _Scratch:
-    """What a frame's encoding needs; grows to what frames need and is kept."""
-
-    blocks: FrameBlocks
-    regressor: Regressor
-    values: ti.Ndarray  # (N or more, channels)
+        if channels not in self._encoders or self._encoders[channels][0].grid is not maps[0]._grid:
+            self._encoders[channels] = maps[0]._make_encoder(channels)
+        return self._encoders[channels]
 
 
 def group_maps(maps: Iterable[PropertyMap]) -> list[PropertyGroup]:

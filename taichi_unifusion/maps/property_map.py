@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,22 +53,25 @@ class PropertyMap(BaseMap):
         return values
 
     def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
-        self._encode_values(self._cells, self._regressor, cloud.points, cloud.attributes[self.name])
+        self._encode_values(self._cells, self._regressor, cloud.points, [cloud.attributes[self.name]])
         return self._cells
 
     _encode_points = _encode_cells
 
     def _encode_values(self, blocks: FrameBlocks, regressor: Regressor, points: NDArray[np.float32],
-                       values: NDArray[np.float32]) -> None:
-        """Encode values (N, c) at points (N, 3) world [m], from cell averages or each as it is."""
-        if self.settings.sampling == "cells":
-            blocks.touch(points, self.voxel_size)
-            blocks.bin(points, values, self.voxel_size)
-            blocks.compact(1)
-            regressor.encode_cells(blocks)
-        else:
-            self._encode_samples(blocks, regressor, points, values)
+                       values: Sequence[NDArray[np.float32]]) -> None:
+        """Encode arrays of values (N, c), side by side, at points (N, 3) world [m], from cell averages or each as it is."""
+        if self.settings.sampling == "points":
+            self._encode_samples(blocks, regressor, points, np.hstack(values))
             blocks.bin_support(points, self.voxel_size, 1)
+            return
+        blocks.touch(points, self.voxel_size)
+        if len(values) == 1:
+            blocks.bin(points, values[0], self.voxel_size)
+        else:
+            blocks.bin_together(points, values, self.voxel_size)
+        blocks.compact(1)
+        regressor.encode_cells(blocks)
 
     def _make_encoder(self, channels: int) -> tuple[FrameBlocks, Regressor]:
         """Scratch to encode `channels` values a point as this map encodes its own."""
