@@ -1,6 +1,6 @@
 """Properties: what a frame costs each map, what a second property adds, and how well images come back.
 
-    python benchmarks/properties.py cost                    # 1280x720 frames of the synthetic room, as in the paper's Table VIII
+    python benchmarks/properties.py cost                    # frames of 1280x720, as in the paper's Table VIII
     python benchmarks/properties.py sharing                 # the time that a second property of three channels adds
     python benchmarks/properties.py quality synthetic       # PSNR at held-out frames: colour, infrared-like, styles
     python benchmarks/properties.py quality house PATH      # the same in the flat of aws-robomaker-small-house-world
@@ -87,7 +87,7 @@ def sharing(frames: int) -> None:
     for voxel_size in (0.1, 0.05, 0.02):
         groups = [PropertyGroup([uf.PropertyMap(name, 3, voxel_size=voxel_size) for name in names])
                   for names in (["first"], ["first", "second"])]
-        laps = np.array([[timed(group.integrate, cloud) for group in groups] for _ in range(3) for cloud in clouds])[len(clouds):]
+        laps = np.array([[timed(group.integrate, cloud) for group in groups] for cloud in clouds * 3])[len(clouds):]
         one, two = np.median(laps, axis=0)
         print(f"{100 * voxel_size:g} cm voxels: one property {one:.1f} ms a frame, two {two:.1f} ms, the second adds "
               f"{100 * np.median((laps[:, 1] - laps[:, 0]) / laps[:, 0]):.0f} %", flush=True)
@@ -120,7 +120,8 @@ def quality(scene: str, path: str | None, voxel_sizes: Sequence[float]) -> None:
                 values, valid = each.query(cloud.points, return_valid=True)
                 squares.append(np.square(values - cloud.attributes[each.name])[valid].mean())
             found[each.name] = np.mean(-10 * np.log10(squares))
-        print(f"{scene}, {100 * voxel_size:g} cm: " + ", ".join(f"{name} {value:.2f} dB" for name, value in found.items()), flush=True)
+        levels = ", ".join(f"{name} {value:.2f} dB" for name, value in found.items())
+        print(f"{scene}, {100 * voxel_size:g} cm: {levels}", flush=True)
         del maps, group
 
 

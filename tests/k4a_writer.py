@@ -17,7 +17,8 @@ import pytest
 
 DEPTH_SIZE, COLOR_SIZE = (320, 288), (640, 360)
 SENSOR, CROP = 512, (96, 90)  # of the depth camera in its 320x288 mode
-DISTORTION = {"D0": (0.5, -0.02, -0.003, 0.85, 0.08, -0.01, -7e-5, 2e-5), "PV0": (0.3, -2.4, 1.4, 0.2, -2.3, 1.37, -1e-4, -2e-4)}
+DISTORTION = {"D0": (0.5, -0.02, -0.003, 0.85, 0.08, -0.01, -7e-5, 2e-5),
+              "PV0": (0.3, -2.4, 1.4, 0.2, -2.3, 1.37, -1e-4, -2e-4)}
 T_COLOR_DEPTH = np.eye(4)
 T_COLOR_DEPTH[:3, :3] = cv2.Rodrigues(np.array([-0.08, 0.01, 0.005]))[0]
 T_COLOR_DEPTH[:3, 3] = -0.032, -0.002, 0.004
@@ -85,7 +86,7 @@ def calibration() -> dict:
 
 def write_k4a(path: Path, frames: int = 3, *, tracks=("COLOR", "DEPTH", "IR"), attached: bytes | None = b"",
               big_endian: bool = True, color_delay: int = 1000) -> Path:
-    """A recording; `attached` None leaves the calibration out, other bytes replace it. Frame n's infrared is n units brighter."""
+    """A recording; `attached` None leaves the calibration out, other bytes replace it. Frame n's infrared is n brighter."""
     av = pytest.importorskip("av", reason="recordings of an Azure Kinect are written and read with PyAV, extra 'k4a'")
     pictures, ok = images(), cv2.imencode(".jpg", images()["COLOR"][..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
     jpeg = ok[1].tobytes()
@@ -100,7 +101,8 @@ def write_k4a(path: Path, frames: int = 3, *, tracks=("COLOR", "DEPTH", "IR"), a
             stream.metadata["title"] = title
             streams[title] = stream
         if attached is not None:
-            container.add_attachment("calibration.json", "application/octet-stream", attached or json.dumps(calibration()).encode())
+            data = attached or json.dumps(calibration()).encode()
+            container.add_attachment("calibration.json", "application/octet-stream", data)
         for n in range(frames):
             for title, stream in streams.items():
                 units = pictures[title] + (n if title == "IR" else 0)

@@ -46,7 +46,8 @@ def color_transform(path: Path, matrix, shape=None, channels_last: bool = False)
         shape = shape or [1, "height", "width", 3]
         return write_network(path, [("MatMul", ["image", "matrix"], ["result"], {})], {"matrix": matrix.T.copy()}, shape, shape)
     shape = shape or open_shape(3)
-    return write_network(path, [("Conv", ["image", "matrix"], ["result"], {})], {"matrix": matrix[:, :, None, None]}, shape, shape)
+    nodes = [("Conv", ["image", "matrix"], ["result"], {})]
+    return write_network(path, nodes, {"matrix": matrix[:, :, None, None]}, shape, shape)
 
 
 def mean_of_channels(path: Path, input_shape, output_shape, **types) -> Path:

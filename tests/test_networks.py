@@ -150,7 +150,7 @@ def test_a_model_of_another_kind_is_said(tmp_path, colors):
     with pytest.raises(InputError, match=r"takes 2 inputs \(image, gain\), not one image"):
         make_property(f"style=onnx:{two}")
     three = color_transform(tmp_path / "three.onnx", np.eye(3))
-    with pytest.raises(InputError, match=r"output 'result' is \(1, 3, 32, 48\) float32, not an image of 1 channel; outputs: result"):
+    with pytest.raises(InputError, match=r"'result' is \(1, 3, 32, 48\) float32, not an image of 1 channel; outputs: result"):
         make_property(f"saliency=onnx:{three}").image(frame_of(colors))
     with pytest.raises(InputError, match="has no output 'mask'; outputs: result"):
         make_property(f"saliency=onnx:{three},output=mask")

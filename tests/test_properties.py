@@ -288,7 +288,8 @@ def test_a_function_is_checked_at_every_frame():
 
 
 @pytest.mark.parametrize(("values", "told"), [
-    ({"name": "a b"}, "a name has letters"), ({"name": "mesh"}, "is none of"), ({"channels": 0}, "channels must be at least 1")])
+    ({"name": "a b"}, "a name has letters"), ({"name": "mesh"}, "is none of"),
+    ({"channels": 0}, "channels must be at least 1")])
 def test_a_property_is_checked_when_it_is_made(values, told):
     with pytest.raises(InputError, match=told):
         SurfaceProperty(**{"name": "own", "channels": 1, "function": lambda frame: frame.depth, **values})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 from dataclasses import replace
 from pathlib import Path
@@ -62,7 +63,8 @@ def test_one_pass_gives_a_map_a_mesh_and_a_picture_each(made):
     for name in ("infrared", "saliency", "drawing"):
         assert {f"maps/{name}.safetensors", f"{name}.ply", f"{name}.glb", f"{name}.png"} <= names
     assert {"mesh.ply", "mesh.glb", "preview.png", "maps/surface.safetensors", "maps/color.safetensors"} <= names
-    sizes = {name: PropertyMap.load(made / "maps" / f"{name}.safetensors").voxel_size for name in ("infrared", "saliency", "color")}
+    sizes = {name: PropertyMap.load(made / "maps" / f"{name}.safetensors").voxel_size
+             for name in ("infrared", "saliency", "color")}
     assert sizes == {"infrared": 0.2, "saliency": 0.1, "color": 0.05}
 
 
@@ -88,7 +90,8 @@ def test_meshes_carry_the_values_and_their_colours(made):
 def test_a_frame_that_lacks_a_property_adds_to_the_other_maps(made):
     metrics = json.loads((made / "metrics.json").read_text())
     assert metrics["frames"]["used"] == 2
-    assert {name: shown["frames"] for name, shown in metrics["properties"].items()} == {"infrared": 1, "saliency": 2, "drawing": 2}
+    frames = {name: shown["frames"] for name, shown in metrics["properties"].items()}
+    assert frames == {"infrared": 1, "saliency": 2, "drawing": 2}
     assert len([w for w in metrics["warnings"] if "no infrared image" in w and "add to the other maps only" in w]) == 1
     assert "infrared image" in metrics["milliseconds"] and "infrared" in metrics["milliseconds"]
 
@@ -131,7 +134,7 @@ def test_networks_run_and_a_property_that_no_frame_gives_costs_nothing_else(reco
 @pytest.mark.parametrize(("arguments", "told"), [
     ([], "say what to map, with --property NAME; properties: infrared, saliency"),
     (["--property", "salency"], "property 'salency' is unknown, did you mean 'saliency'?"),
-    (["--property", "saliency", "--property", "saliency"], "property 'saliency' is asked for twice; give one of them another name"),
+    (["--property", "saliency", "--property", "saliency"], "'saliency' is asked for twice; give one of them another name"),
     (["--property", "saliency=onnx:none.onnx"], "none.onnx: no such file"),
 ])
 def test_V4_what_cannot_be_mapped_is_said_before_the_first_frame(recording, tmp_path, capsys, arguments, told):
@@ -167,8 +170,8 @@ def fails(frame):
     return frame.depth
 
 
-OWN = [SurfaceProperty("warmth", 1, warmth, Look("diverging", (-1, 1), "red minus blue")), SurfaceProperty("constant", 3, constant),
-       SurfaceProperty("half", 1, half)]
+OWN = [SurfaceProperty("warmth", 1, warmth, Look("diverging", (-1, 1), "red minus blue")),
+       SurfaceProperty("constant", 3, constant), SurfaceProperty("half", 1, half)]
 
 
 @pytest.fixture(scope="module")
@@ -237,3 +240,14 @@ def test_a_function_that_fails_ends_the_run_and_keeps_what_was_done(frames, monk
 def test_apps_run(recording, tmp_path, app, files):
     runpy.run_path(str(ROOT / "apps" / f"{app}.py"))["main"]("folder", str(recording), str(tmp_path / "out"))
     assert all((tmp_path / "out" / name).exists() for name in files)
+
+
+def test_the_page_on_properties_runs(tmp_path, monkeypatch):
+    """Its example of a function of one's own, on smaller frames."""
+    text = (ROOT / "docs" / "properties.md").read_text()
+    (snippet,) = re.findall(r"```python\n(import numpy.*?)```", text, re.S)
+    monkeypatch.chdir(tmp_path)
+    smaller = snippet.replace('"synthetic", frames=5)', '"synthetic", frames=60, width=160, height=120)[:1]')
+    assert smaller != snippet
+    exec(compile(smaller, "properties.md", "exec"), {})  # noqa: S102
+    assert (tmp_path / "results" / "warmth" / "warmth.png").exists()

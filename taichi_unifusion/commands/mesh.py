@@ -23,8 +23,8 @@ class ExtractMesh:
     """Cells along the edge of a surface voxel; 8 gives 4 times the triangles of 4."""
     min_area: Annotated[float, arg(metavar="M2")] = MeshSettings.min_area
     """Connected parts of less than this area, in square metres, are left out; 0 keeps all."""
-    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: DIR/mesh.ply, DIR/mesh.glb, and those of properties)")] = None
-    """Where to write it: .ply, .glb or .obj."""
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: DIR/mesh.ply and DIR/mesh.glb)")] = None
+    """Where to write it: .ply, .glb or .obj; by default the meshes of single properties are written again too."""
     device: Literal["auto", "cuda", "cpu"] = "auto"
     """Where to compute."""
 

@@ -18,7 +18,7 @@ from .reconstruct import Reconstruct, ReconstructOptions, reconstruct
 class TransferOptions(ReconstructOptions):
     """Map properties of the frames (infrared, saliency, style, ...) onto the surface, beside its colour, in one pass.
 
-    Example: unifusion transfer 7scenes my/redkitchen --every 10 --property saliency --property style=sketch --out results/kitchen
+    Example: unifusion transfer 7scenes my/redkitchen --property saliency --property style=sketch --out results/kitchen
 
     Each gives a mesh NAME.ply and NAME.glb, a picture NAME.png with a legend, and maps/NAME.safetensors.
 

@@ -30,8 +30,9 @@ def open_dataset(format: str, path: str | Path | None = None, **options) -> Data
     """Open the recording at `path`; frames are read when indexed.
 
     Recordings take `depth_scale` (units a metre), `camera` (a PinholeCamera of the depth images) and `drop_alpha`, "tum" and
-    "folder" also `max_difference` [s]; "synthetic" and "scene" are rendered and have options of their own. Raises DatasetError for an unknown format, a path that does not
-    exist or holds no such recording, InputError for an unknown option.
+    "folder" also `max_difference` [s]; "k4a" takes `align`, `depth_scale` and `max_difference`; "synthetic" and "scene" are
+    rendered and have options of their own. Raises DatasetError for an unknown format, a path that does not exist or holds no
+    such recording, InputError for an unknown option.
     """
     if format not in FORMATS:
         raise DatasetError(f"format '{format}' is unknown{_suggest(format, FORMATS)}; formats: {', '.join(FORMATS)}")

@@ -73,8 +73,8 @@ def read_infrared(path: Path) -> NDArray[np.float32]:
     image = _decode(_read_bytes(path), str(path))
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise FrameError(f"{path}: infrared must be one channel of 8 or 16 bits, got {channels} of {image.dtype}; convert it to "
-                         "grey values")
+        raise FrameError(f"{path}: infrared must be one channel of 8 or 16 bits, got {channels} of {image.dtype}; convert it "
+                         "to grey values")
     return image.astype(np.float32) * np.float32(257 if image.dtype == np.uint8 else 1)  # 255 * 257 = 65535
 
 

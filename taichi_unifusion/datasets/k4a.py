@@ -67,7 +67,8 @@ class K4aFile(Dataset):
             attached = next((s.data for s in container.streams.attachments if s.name == CALIBRATION), None)
             if attached is None:
                 raise DatasetError(f"{path}: no {CALIBRATION} is attached; was the recording converted by another program?")
-            self.calibration = read_calibration(attached, f"{path}: {CALIBRATION}", self.sizes["DEPTH"], self.sizes.get("COLOR"))
+            self.calibration = read_calibration(attached, f"{path}: {CALIBRATION}", self.sizes["DEPTH"],
+                                                self.sizes.get("COLOR"))
             self.unit = float(streams["DEPTH"].time_base)  # [s] of a time stamp; a Matroska file has one for all tracks
             stamps = {title: [] for title in streams}
             for packet in container.demux(*streams.values()):
@@ -82,8 +83,8 @@ class K4aFile(Dataset):
         self.poses = _read_poses(path.with_suffix(".txt"), times, max_difference)
         self.warnings = tuple(pose_warnings([pose for pose in self.poses if pose.T_world_camera is not None or pose.problem]))
         if any(pose.T_world_camera is None and not pose.problem for pose in self.poses):
-            self.warnings = (f"there is no {path.with_suffix('.txt').name} with poses beside {path.name}: the first frame's camera "
-                             "is the world, and the other frames have no pose",)
+            self.warnings = (f"there is no {path.with_suffix('.txt').name} with poses beside {path.name}: the first frame's "
+                             "camera is the world, and the other frames have no pose",)
 
     @property
     def camera(self):

@@ -54,7 +54,7 @@ def read_calibration(data: bytes, source: str, depth_size: tuple[int, int],
     except (KeyError, TypeError, ValueError) as error:  # JSON and Unicode errors are ValueErrors
         if isinstance(error, DatasetError) and not isinstance(error, PoseError):
             raise
-        raise DatasetError(f"{source}: not the factory calibration of an Azure Kinect ({type(error).__name__}: {error})") from error
+        raise DatasetError(f"{source}: not the factory calibration of an Azure Kinect ({type(error).__name__}: {error})") from None
 
 
 def _color_mode(width: int, height: int) -> tuple[tuple[int, int], tuple[int, int]]:

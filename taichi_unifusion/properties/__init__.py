@@ -1,6 +1,7 @@
 """The paper's f_im (Fig. 6): functions that give an image of a property for every frame, by name.
 
-`make_property("style=sketch,voxel_size=0.05")` gives one of these, with options; your own is a `SurfaceProperty` with a function.
+`make_property("style=sketch,voxel_size=0.05")` gives one of these, with options; your own is a `SurfaceProperty` with a
+function.
 """
 
 from __future__ import annotations

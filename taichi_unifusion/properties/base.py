@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError, InputError, UniFusionError
 from ..maps.settings import PropertySettings
 from ..types import Frame
-from .colormaps import COLORMAPS, check_colormap
+from .colormaps import check_colormap
 
 RESERVED = ("surface", "color", "mesh", "preview", "normals")  # files and attributes of every results folder
 
@@ -37,8 +37,8 @@ class SurfaceProperty:
 
         SurfaceProperty("redness", channels=1, function=redness)
 
-    `function` takes a Frame and returns (H, W) or (H, W, c) numbers as large as the depth image; NaN says that there is no value.
-    It raises FrameError where a frame cannot give the property; that frame then adds to the other maps only.
+    `function` takes a Frame and returns (H, W) or (H, W, c) numbers as large as the depth image; NaN says that there is no
+    value. It raises FrameError where a frame cannot give the property; that frame then adds to the other maps only.
     """
 
     name: str
@@ -49,7 +49,8 @@ class SurfaceProperty:
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name) or self.name in RESERVED:
-            raise InputError(f"property '{self.name}': a name has letters, digits, _ and -, and is none of {', '.join(RESERVED)}")
+            raise InputError(f"property '{self.name}': a name has letters, digits, _ and -, and is none of "
+                             f"{', '.join(RESERVED)}")
         if self.channels < 1:
             raise InputError(f"property '{self.name}': channels must be at least 1, got {self.channels}")
 
@@ -81,6 +82,3 @@ def color_of(frame: Frame) -> NDArray[np.uint8]:
     if frame.color is None:
         raise FrameError("there is no colour image to make it from")
     return frame.color
-
-
-__all__ = ["COLORMAPS", "Look", "SurfaceProperty", "color_of"]

@@ -41,7 +41,7 @@ def color_table(name: str) -> NDArray[np.float32]:
 
 
 def colorize(values: NDArray, colormap: str, low: float, high: float) -> NDArray[np.float32]:
-    """Colours (N, 3) RGB in [0, 1] of values (N, c): by the colour map for one channel, as RGB for three; NaN is the low end."""
+    """Colours (N, 3) RGB in [0, 1] of values (N, c): by the colour map for one channel, as RGB for three; NaN counts as 0."""
     share = np.clip(np.nan_to_num((np.asarray(values, np.float32) - low) / (high - low)), 0, 1)
     if share.shape[1] == 3:
         return share

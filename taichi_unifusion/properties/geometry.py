@@ -26,7 +26,7 @@ def surface_normal() -> SurfaceProperty:
 
 
 def mean_curvature(*, radius: int = 6) -> SurfaceProperty:
-    """Mean curvature [1/m] over `radius` pixels to each side: positive on a ball, negative in a bowl, 0 on a plane or saddle."""
+    """Mean curvature [1/m] over `radius` pixels to each side: positive on a ball, negative in a bowl, 0 on a plane."""
     if not 1 <= radius <= 50:
         raise InputError(f"curvature: radius must lie in 1..50 pixels, got {radius}")
 

@@ -42,5 +42,5 @@ def _infrared_of(frame: Frame) -> NDArray[np.float32]:
     """The frame's infrared image (H, W) in units of 0..65535, or FrameError."""
     image = frame.images.get("infrared")
     if image is None:
-        raise FrameError("the recording has no infrared image for it (k4a, and folder or scannet with a folder infrared/, have)")
+        raise FrameError("the recording has no infrared image for it (k4a has; folder and scannet in a folder infrared/)")
     return image[..., 0]

@@ -67,7 +67,8 @@ class ImageNetwork:
         """The input, whether its channels come before rows and columns, and its (width, height), None if any will do."""
         inputs = self.session.get_inputs()
         if len(inputs) != 1:
-            raise InputError(f"{self.file}: takes {len(inputs)} inputs ({', '.join(item.name for item in inputs)}), not one image")
+            names = ", ".join(item.name for item in inputs)
+            raise InputError(f"{self.file}: takes {len(inputs)} inputs ({names}), not one image")
         (wanted,) = inputs
         shape = [dim if isinstance(dim, int) else None for dim in wanted.shape]  # open dimensions bear names
         at = f"{self.file}: its input '{wanted.name}' is {wanted.shape} {wanted.type}"

@@ -32,7 +32,7 @@ OPTION = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)=(.*)", re.DOTALL)
 
 
 def make_property(text: str, settings: PropertySettings | None = None) -> SurfaceProperty:
-    """The property that the text names; `settings` of its map where the text says nothing else (the configuration's defaults without them).
+    """The property that the text names; `settings` of its map where the text says nothing else, else the defaults.
 
     Raises InputError, with the right names, for an unknown property, method or option or a value that does not fit, and
     whatever making it raises: FileError for a model that is missing, MissingDependency for a package.
@@ -54,7 +54,8 @@ def make_property(text: str, settings: PropertySettings | None = None) -> Surfac
         if key not in known:
             raise InputError(f"property '{text}': option '{key}' is unknown{_suggest(key, known)}; options: {', '.join(known)}")
     types, map_types = get_type_hints(maker), get_type_hints(PropertySettings)
-    given = {key: _convert(value, types[key], f"property '{text}': {key}") for key, value in options.items() if key in parameters}
+    given = {key: _convert(value, types[key], f"property '{text}': {key}")
+             for key, value in options.items() if key in parameters}
     changes = {key: _convert(value, map_types[key], f"property '{text}': {key}")
                for key, value in options.items() if key in of_map}
     made = maker(Path(file).expanduser(), **given) if file else maker(**given)

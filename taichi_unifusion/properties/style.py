@@ -14,7 +14,7 @@ from ..types import Frame
 from .base import Look, SurfaceProperty, color_of
 from .networks import ImageNetwork, check_preparation, prepare
 
-LOOK = Look(label="style")
+LOOK = Look()
 CONTOUR_WIDTH = 1.0  # [pixels]
 FAINTEST = 0.017     # change of brightness a pixel from which there is a contour
 OVERSHOOT = 10.0  # times the stated range that an output may reach before the range must be wrong
@@ -47,7 +47,7 @@ def opencv_style(*, smoothness: float = 60.0, detail: float = 0.45) -> SurfacePr
 
     def function(frame: Frame) -> NDArray[np.float32]:
         bgr = _bgr_of(frame)
-        grain = np.random.default_rng(0).integers(0, 2, bgr.shape, dtype=np.uint8)  # without it the filter makes flat areas black
+        grain = np.random.default_rng(0).integers(0, 2, bgr.shape, dtype=np.uint8)  # without it flat areas become black
         painted = cv2.stylization(np.where(bgr < 128, bgr + grain, bgr - grain), sigma_s=smoothness, sigma_r=detail)
         return _as_rgb(painted)
 
