@@ -82,7 +82,7 @@ def test_fuse_information_equals_its_twin(centered):
     masks = rng.integers(0, 2**32, (voxels, 2), dtype=np.uint32)
     assert sums.shape == (voxels, q)
     arrays = map_sums, map_latents, map_weights, map_masks
-    fusion.fuse_information(rank, size, rows, channels, centered, voxels, slots, sums, weights, masks, 1.0, 0.3, *arrays)
+    fusion.fuse_information(rank, size, rows, channels, centered, 0, channels, voxels, slots, sums, weights, masks, 1.0, 0.3, *arrays)
     for n in range(voxels):
         if slots[n] >= 0:
             F, w = twin.fuse_information([old[n], new[n]], [int(known[n]), 1], 0.3)
@@ -90,7 +90,7 @@ def test_fuse_information_equals_its_twin(centered):
             np.testing.assert_allclose(map_latents[n], F, atol=LATENT * np.abs(F).max())
         else:
             assert not map_latents[n].any() and map_weights[n] == old[n].w * known[n] and not map_masks[n].any()
-    fusion.fuse_information(rank, size, rows, channels, centered, voxels, slots, sums, weights, masks, -1.0, 0.3, *arrays)
+    fusion.fuse_information(rank, size, rows, channels, centered, 0, channels, voxels, slots, sums, weights, masks, -1.0, 0.3, *arrays)
     for n in np.flatnonzero(slots >= 0):
         assert map_weights[n] == old[n].w * known[n]
         if known[n]:
@@ -107,7 +107,7 @@ def test_fuse_with_sign_minus_one_undoes_it():
     masks, slots = np.zeros((20, 2), np.uint32), np.arange(20, dtype=np.int32)
     latents, left = old.copy(), weights.copy()
     for sign in (1.0, -1.0):
-        fusion.fuse(rows, channels, 20, slots, new, more, masks, sign, latents, left, masks.copy())
+        fusion.fuse(rows, channels, 0, 20, slots, new, more, masks, sign, latents, left, masks.copy())
     np.testing.assert_array_equal(left, weights)
     np.testing.assert_allclose(latents[5:], old[5:], atol=3e-5)  # weights differ up to 50-fold
     assert not left[:5].any()
