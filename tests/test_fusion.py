@@ -82,7 +82,8 @@ def test_fuse_information_equals_its_twin(centered):
     masks = rng.integers(0, 2**32, (voxels, 2), dtype=np.uint32)
     assert sums.shape == (voxels, q)
     arrays = map_sums, map_latents, map_weights, map_masks
-    fusion.fuse_information(rank, size, rows, channels, centered, 0, channels, voxels, slots, sums, weights, masks, 1.0, 0.3, *arrays)
+    fusion.fuse_information(rank, size, rows, channels, centered, 0, channels, voxels, slots, sums, weights, masks, 1.0, 0.3,
+                            *arrays)
     for n in range(voxels):
         if slots[n] >= 0:
             F, w = twin.fuse_information([old[n], new[n]], [int(known[n]), 1], 0.3)
@@ -90,7 +91,8 @@ def test_fuse_information_equals_its_twin(centered):
             np.testing.assert_allclose(map_latents[n], F, atol=LATENT * np.abs(F).max())
         else:
             assert not map_latents[n].any() and map_weights[n] == old[n].w * known[n] and not map_masks[n].any()
-    fusion.fuse_information(rank, size, rows, channels, centered, 0, channels, voxels, slots, sums, weights, masks, -1.0, 0.3, *arrays)
+    fusion.fuse_information(rank, size, rows, channels, centered, 0, channels, voxels, slots, sums, weights, masks, -1.0, 0.3,
+                            *arrays)
     for n in np.flatnonzero(slots >= 0):
         assert map_weights[n] == old[n].w * known[n]
         if known[n]:
