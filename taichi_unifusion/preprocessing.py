@@ -72,7 +72,7 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
             kernels.sample_color(pixels, np.ascontiguousarray(frame.color), values)
         else:
             kernels.sample_image(pixels, np.ascontiguousarray(frame.images[name]), values)
-    return PointCloud(points, point_normals, attributes, view)
+    return PointCloud(points, point_normals, attributes, view, frame.features)
 
 
 def _view(frame: Frame, settings: PreprocessSettings) -> DepthView:

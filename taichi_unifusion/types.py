@@ -73,6 +73,26 @@ def check_rigid(T: NDArray, name: str = "T_world_camera") -> NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class FeatureImage:
+    """An image of high-dimensional features, as small as its network made it, and where it was taken from."""
+
+    values: NDArray[np.float32]              # (h, w, c); pixels that are not finite are left out
+    camera: PinholeCamera                    # of this image: w x h
+    T_camera_cloud: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))  # (4, 4) from the points it belongs to
+
+    def __post_init__(self) -> None:
+        if self.values.ndim != 3 or self.values.dtype != np.float32:
+            raise FrameError(f"feature image: must be (h, w, c) float32, got {self.values.shape} {self.values.dtype}")
+        if self.values.shape[1::-1] != self.camera.size:
+            raise SizeMismatch(f"feature image: is {self.values.shape[1]}x{self.values.shape[0]} but its camera is "
+                               f"{self.camera.width}x{self.camera.height}")
+
+    def transformed(self, T_b_a: NDArray) -> FeatureImage:
+        """The same image for points that were given in frame a and now are in frame b."""
+        return replace(self, T_camera_cloud=self.T_camera_cloud @ np.linalg.inv(T_b_a))
+
+
+@dataclass(frozen=True)
 class Frame:
     """One RGB-D image with its camera and, if known, its pose."""
 
@@ -84,6 +104,7 @@ class Frame:
     timestamp: float | None = None                        # [s]
     name: str = ""                                        # where it came from, for messages
     images: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)  # property images, (H, W, c)
+    features: Mapping[str, FeatureImage] = field(default_factory=dict)       # of any size, (h, w, c)
 
     def __post_init__(self) -> None:
         at = f"frame {self.name or self.index}"
@@ -117,6 +138,14 @@ class Frame:
         """A copy that lacks the property image `name`."""
         return replace(self, images={key: image for key, image in self.images.items() if key != name})
 
+    def with_features(self, name: str, values: NDArray) -> Frame:
+        """A copy that also carries the feature image `name`, (h, w, c), of the same view at any resolution."""
+        values = np.ascontiguousarray(values, dtype=np.float32)
+        if values.ndim != 3:
+            raise FrameError(f"frame {self.name or self.index}: features '{name}' must be (h, w, c), got {values.shape}")
+        image = FeatureImage(values, self.camera.resized(values.shape[1], values.shape[0]))
+        return replace(self, features={**self.features, name: image})
+
 
 @dataclass(frozen=True)
 class DepthView:
@@ -144,6 +173,7 @@ class PointCloud:
     normals: NDArray[np.float32] | None = None  # (N, 3) unit, towards the camera
     attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)  # name -> (N, c); "color" is RGB in [0, 1]
     view: DepthView | None = None              # from where it was seen, if that is known
+    features: Mapping[str, FeatureImage] = field(default_factory=dict)  # images that see these points
 
     def __post_init__(self) -> None:
         for name, array, columns in (("points", self.points, 3), ("normals", self.normals, 3),
@@ -178,7 +208,8 @@ class PointCloud:
             if vectors is not None and len(vectors):
                 transform(np.ascontiguousarray(vectors), matrix, moved[-1])
         view = self.view and replace(self.view, T_camera_cloud=self.view.T_camera_cloud @ np.linalg.inv(T_b_a))
-        return replace(self, points=moved[0], normals=moved[1], view=view)
+        features = {name: image.transformed(T_b_a) for name, image in self.features.items()}
+        return replace(self, points=moved[0], normals=moved[1], view=view, features=features)
 
 
 @dataclass(frozen=True)

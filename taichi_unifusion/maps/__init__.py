@@ -8,22 +8,24 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .base_map import BaseMap, Integration
+    from .latent_map import LatentMap
     from .property_group import PropertyGroup
     from .property_map import PropertyMap
-    from .settings import MapSettings, PropertySettings, SurfaceSettings
+    from .settings import LatentSettings, MapSettings, PropertySettings, SurfaceSettings
     from .surface_map import SurfaceMap
 
-__all__ = ["BaseMap", "Integration", "MapSettings", "PropertyGroup", "PropertyMap", "PropertySettings", "SurfaceMap",
-           "SurfaceSettings", "load_map"]
+__all__ = ["BaseMap", "Integration", "LatentMap", "LatentSettings", "MapSettings", "PropertyGroup", "PropertyMap",
+           "PropertySettings", "SurfaceMap", "SurfaceSettings", "load_map"]
 
 _MODULES = {"BaseMap": "base_map", "Integration": "base_map", "PropertyMap": "property_map",
             "PropertyGroup": "property_group", "SurfaceMap": "surface_map",
+            "LatentMap": "latent_map", "LatentSettings": "settings",
             "MapSettings": "settings", "PropertySettings": "settings", "SurfaceSettings": "settings"}
 
 
 def load_map(path: str | Path) -> BaseMap:
     """The map in a file, of whatever kind it is; raises MapCorrupt or FileError."""
-    for module in ("property_map", "surface_map"):  # a kind of map registers itself when its module loads
+    for module in ("property_map", "latent_map", "surface_map"):  # a kind of map registers itself when its module loads
         import_module(f".{module}", __name__)
     return __getattr__("BaseMap").load(path)
 

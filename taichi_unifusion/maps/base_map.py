@@ -123,10 +123,13 @@ class BaseMap(ABC):
 
     def merge(self, other: BaseMap) -> None:
         """Fuse another map of the same settings into this one (Eq. 19 is associative); raises InputError where they differ."""
+        self._check_mergeable(other)
+        self._fuse_data(other._grid.export())
+
+    def _check_mergeable(self, other: BaseMap) -> None:
         if (other.kind, other.name, other.channels, other.settings) != (self.kind, self.name, self.channels, self.settings):
             raise InputError(f"merge: the maps differ: {self.kind} '{self.name}' x{self.channels} {self.settings} and "
                              f"{other.kind} '{other.name}' x{other.channels} {other.settings}")
-        self._fuse_data(other._grid.export())
 
     def _fuse_data(self, data: VoxelData) -> None:
         n = len(data.keys)
@@ -140,8 +143,7 @@ class BaseMap(ABC):
 
     def save(self, path: str | Path) -> None:
         """Write the map to one file; readable on any device. Raises FileError where that fails; an old file then stays."""
-        data = self._grid.export()
-        write_map(Path(path), {name: tensor for name, tensor in vars(data).items() if tensor is not None},
+        write_map(Path(path), self._tensors(),
                   {"kind": self.kind, "name": self.name, "channels": self.channels, "voxels": len(self),
                    "settings": dataclasses.asdict(self.settings)})
 
@@ -152,7 +154,6 @@ class BaseMap(ABC):
         target = BaseMap.registry.get(manifest.get("kind"))
         if target is None or not issubclass(target, cls):
             raise MapCorrupt(f"{path}: holds a map of kind '{manifest.get('kind')}', not '{getattr(cls, 'kind', 'any')}'")
-        data = VoxelData(**{field.name: tensors.get(field.name) for field in dataclasses.fields(VoxelData)})
         try:
             values = dict(manifest["settings"])
             settings = target.settings_type(**{**values, "encoder": EncoderSettings(**values["encoder"])})
@@ -160,9 +161,18 @@ class BaseMap(ABC):
         except (KeyError, TypeError, InputError) as error:
             raise MapCorrupt(f"{path}: its settings are not those of a map of this version of taichi_unifusion; "
                              "integrate the frames again") from error
-        restored._check_data(path, data)
-        restored._fuse_data(data)
+        restored._restore_tensors(path, tensors)
         return restored
+
+    def _tensors(self) -> dict[str, NDArray]:
+        """All voxels as the arrays of a map file."""
+        return {name: tensor for name, tensor in vars(self._grid.export()).items() if tensor is not None}
+
+    def _restore_tensors(self, path: str | Path, tensors: dict[str, NDArray]) -> None:
+        """Fill this empty map from the arrays of a map file; raises MapCorrupt where they do not fit."""
+        data = VoxelData(**{field.name: tensors.get(field.name) for field in dataclasses.fields(VoxelData)})
+        self._check_data(path, data)
+        self._fuse_data(data)
 
     @classmethod
     @abstractmethod
@@ -171,7 +181,7 @@ class BaseMap(ABC):
 
     def _check_data(self, path: str | Path, data: VoxelData) -> None:
         n = -1 if data.keys is None else len(data.keys)
-        wanted = {"keys": ((n, 3), np.int32), "latents": ((n, self._grid.rows, self.channels), np.float32),
+        wanted = {"keys": ((n, 3), np.int32), "latents": ((n, self._grid.rows, self._grid.channels), np.float32),
                   "weights": ((n,), np.float32), "masks": ((n, 2), np.uint32)}
         if self._grid.with_evidence:
             wanted["evidence"] = ((n, voxels.BLOCK_CELLS), np.int8)

@@ -8,6 +8,8 @@ from typing import Literal
 from ..encoding import EncoderSettings
 from ..errors import InputError
 
+MAX_LATENT_RANK = 20  # of a map of features: its kernels unroll over it
+
 
 @dataclass(frozen=True)
 class MapSettings:
@@ -94,6 +96,28 @@ class PropertySettings(MapSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_choice("prior", self.prior, ("mean", "zero"))
+
+
+@dataclass(frozen=True)
+class LatentSettings(MapSettings):
+    """Settings of a map of high-dimensional features (Sec. IV-D)."""
+
+    voxel_size: float = 0.1
+    """Voxel edge in metres; a latent describes a cube of twice this edge."""
+    noise: float = 3.0
+    """Observation noise d of the regression (Eq. 6) for one feature pixel, relative to the kernel's variance."""
+    fusion: Literal["mean", "information"] = "information"
+    """information: the regression runs over all frames at once; there is no other way here, as it costs no more memory."""
+    encoder: EncoderSettings = field(default_factory=lambda: EncoderSettings(rank=4))
+    """The position encoding; a voxel keeps so many numbers a channel: their mean and the eigenpairs from the second on."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sampling != "cells" or self.fusion != "information":
+            raise InputError("a map of features knows sampling 'cells' and fusion 'information' only, got "
+                             f"'{self.sampling}' and '{self.fusion}'")
+        if not 2 <= self.encoder.rank <= MAX_LATENT_RANK:
+            raise InputError(f"encoder: rank must lie in 2..{MAX_LATENT_RANK} in a map of features, got {self.encoder.rank}")
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -1,0 +1,368 @@
+"""High-dimensional features of the surface: regressed and fused as sums, solved only when they are asked for (Sec. IV-D).
+
+A voxel keeps running means over all that was seen in its doubled voxel: of the features y (its *mean* row), of f y^T (a row
+for each of q position features f), of f and of f f^T (its *moments*). Eq. 19 fuses means exactly, so that
+
+    F = (E[f f^T] - E[f] E[f]^T + d / w I)^-1 (E[f y^T] - E[f] E[y]^T)
+
+is the regression (Eq. 6) over all frames at once, about the mean of what was seen. Everything is linear in y: a text is
+multiplied onto the rows first, and the regression is then solved for one number instead of c.
+"""
+
+import taichi as ti
+
+from .cells import cell_center
+from .query import nearest_voxel
+from .regression import cell_row, neighbor_step
+from .voxels import INDEX_HALF, Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, all_within, row3, voxel_of
+
+ENTRIES = 512    # cells of a doubled voxel, at most
+CHANNELS = 16    # channels that a worker sums at once
+Halves3 = ti.types.ndarray(dtype=ti.f16, ndim=3)
+Bytes1 = ti.types.ndarray(dtype=ti.u8, ndim=1)
+
+
+@ti.kernel
+def find_pixels(
+    # in:
+    blocks: ti.i32,
+    keys: Ints2,          # (B, 3)
+    starts: Ints1,        # (B,) first row of each block in `cells`
+    masks: Masks2,        # (B, 2) cells that hold points
+    cells: Floats2,       # (M, 4) root of the count, then the mean offset from the cell's centre [voxels], times it
+    voxel_size: ti.f32,
+    projection: Floats2,  # (3, 4) world [m] -> homogeneous pixel of the feature image
+    width: ti.i32,
+    usable: Bytes1,       # (h * w,) 1 where a feature is finite
+    minimum: ti.i32,
+    # out:
+    pixels: Ints1,        # (M,) feature pixel that a cell's mean point falls into, -1 where none
+    seen: Ints1,          # (h * w,) += points in the pixel
+    weights: Floats1,     # (B,) points of the block that have a feature; 0 for fewer than `minimum`
+):
+    for b in range(blocks):
+        n, total = starts[b], 0
+        for half in range(2):
+            mask = masks[b, half]
+            while mask != 0:
+                k = ti.math.clz(ti.cast(mask, ti.i32))
+                mask ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
+                root = cells[n, 0]
+                offset = ti.Vector([cells[n, 1], cells[n, 2], cells[n, 3]]) / root
+                x = (row3(keys, b) + cell_center(half * 32 + k) + offset) * voxel_size
+                h = ti.Vector([projection[i, 0] * x[0] + projection[i, 1] * x[1] + projection[i, 2] * x[2] + projection[i, 3]
+                               for i in ti.static(range(3))])
+                pixel = -1
+                if h[2] > 1e-6:
+                    u, v = ti.floor(h[0] / h[2] + 0.5, ti.i32), ti.floor(h[1] / h[2] + 0.5, ti.i32)
+                    if u >= 0 and v >= 0 and u < width and v < usable.shape[0] // width:
+                        if usable[v * width + u] != 0:
+                            pixel = v * width + u
+                if pixel >= 0:
+                    count = ti.round(root * root, ti.i32)
+                    total += count
+                    ti.atomic_add(seen[pixel], count)
+                pixels[n] = pixel
+                n += 1
+        weights[b] = ti.cast(total, ti.f32) if total >= minimum else 0.0
+
+
+@ti.func
+def gather_entries(
+    # in:
+    rank: ti.template(), v: ti.i32, worker: ti.i32, neighbors: ti.template(), masks: ti.template(), window: ti.template(),
+    starts: ti.template(), cells: ti.template(), pixels: ti.template(), features: ti.template(), scale: ti.f32,
+    # out:
+    factors: ti.template(), places: ti.template(),
+):
+    """The cells in a doubled voxel that have a feature: their weight and weighted position features; returns how many."""
+    filled = 0
+    for o in range(27):
+        b, step = neighbors[v, o], neighbor_step(o)
+        if b >= 0:
+            for half in range(2):
+                occupied = masks[b, half]
+                wanted = occupied & window[o, half]
+                while wanted != 0:
+                    k = ti.math.clz(ti.cast(wanted, ti.i32))
+                    wanted ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
+                    n = starts[b] + ti.math.popcnt((occupied >> 1) >> ti.cast(31 - k, ti.u32))
+                    if half == 1:
+                        n += ti.math.popcnt(masks[b, 0])
+                    if pixels[n] >= 0:
+                        weight = cells[n, 0] * cells[n, 0] * scale
+                        at = cell_row(half * 32 + k, step)
+                        factors[worker, 0, filled] = weight
+                        for a in ti.static(range(rank)):
+                            factors[worker, 1 + a, filled] = weight * features[at, a]
+                        places[worker, filled] = pixels[n]
+                        filled += 1
+    for k in range(filled, (filled + 15) // 16 * 16):  # a whole number of vectors
+        for a in ti.static(range(1 + rank)):
+            factors[worker, a, k] = 0.0
+        places[worker, k] = 0
+    return filled
+
+
+@ti.func
+def fuse_moments(rank: ti.template(), s: ti.i32, worker: ti.i32, filled: ti.i32, factors: ti.template(),
+                 moments: ti.template(), weights: ti.template()):
+    """Fuse E[f] and the lower triangle of E[f f^T] of a voxel; returns its new weight and the share of it that is new."""
+    weight = 0.0
+    for k in range(filled):
+        weight += factors[worker, 0, k]
+    old = weights[s]
+    share = weight / (old + weight) if old > 0 else 1.0
+    at = 0
+    for a in range(rank):
+        mean = 0.0
+        for k in range(filled):
+            mean += factors[worker, 1 + a, k]
+        moments[s, a, 0] = moments[s, a, 0] + (mean / weight - moments[s, a, 0]) * share
+        for b in range(a + 1):
+            product = 0.0
+            for k in range(filled):
+                product += factors[worker, 1 + a, k] * factors[worker, 1 + b, k] / factors[worker, 0, k]
+            place = rank + at
+            moments[s, place, 0] = moments[s, place, 0] + (product / weight - moments[s, place, 0]) * share
+            at += 1
+    weights[s] = old + weight
+    return weight, share
+
+
+@ti.kernel
+def fuse_features(
+    # in:
+    rank: ti.template(),   # q
+    blocks: ti.i32,
+    slots: Ints1,          # (B,) slot in the map, -1 where the block is left out
+    neighbors: Ints2,      # (B, 27)
+    masks: Masks2, window: Masks2, starts: Ints1, cells: Floats2,  # as find_pixels; (27, 2) cells of each neighbour that count
+    pixels: Ints1,         # (M,)
+    features: Floats2,     # (8^3, q) position features at the cell centres of a doubled voxel
+    image: Floats2,        # (h * w, c) features, c rounded up to CHANNELS
+    scale: ti.f32,         # weight of a point: feature pixels a point
+    workers: ti.i32, stride: ti.i32,
+    # out:
+    factors: ti.template(), places: ti.template(), tiles: ti.template(),  # scratch of each worker
+    rows: Halves3,         # (S, 1 + q, c) E[y], E[f y^T]
+    moments: Floats3,      # (S, q + q (q + 1) / 2, 1) E[f], E[f f^T]
+    weights: Floats1,      # (S,) feature pixels seen in the doubled voxel
+):
+    for i in range(workers * stride):
+        if i % stride == 0:
+            worker = i // stride
+            for v in range(worker * blocks // workers, (worker + 1) * blocks // workers):
+                s = slots[v]
+                if s >= 0:
+                    filled = gather_entries(rank, v, worker, neighbors, masks, window, starts, cells, pixels, features, scale,
+                                            factors, places)
+                    weight, share = fuse_moments(rank, s, worker, filled, factors, moments, weights)
+                    length = (filled + 15) // 16 * 16
+                    for part in range(image.shape[1] // CHANNELS):
+                        for k in range(length):  # transposed, so that the sums below run over the contiguous axis
+                            for c in ti.static(range(CHANNELS)):
+                                tiles[worker, c, k] = image[places[worker, k], part * CHANNELS + c]
+                        for c in range(ti.min(CHANNELS, rows.shape[2] - part * CHANNELS)):
+                            sums = ti.Vector([0.0] * (1 + rank))
+                            for k in range(length):
+                                y = tiles[worker, c, k]
+                                for a in ti.static(range(1 + rank)):
+                                    sums[a] += factors[worker, a, k] * y
+                            channel = part * CHANNELS + c
+                            for a in ti.static(range(1 + rank)):
+                                before = ti.cast(rows[s, a, channel], ti.f32)
+                                after = before + (sums[a] / weight - before) * share
+                                rows[s, a, channel] = ti.cast(after, ti.f16)
+
+
+@ti.kernel
+def fuse_rows(
+    # in:
+    voxels: ti.i32,
+    slots: Ints1,          # (N,)
+    rows: Halves3,         # (N, r, c)
+    weights: Floats1,      # (N,)
+    map_weights: Floats1,  # (S,) before these are added
+    # out:
+    map_rows: Halves3,     # (S, r, c)
+):
+    for n in range(voxels):
+        s = slots[n]
+        old = map_weights[s]
+        share = weights[n] / (old + weights[n]) if old > 0 else 1.0
+        for a in range(rows.shape[1]):
+            for c in range(rows.shape[2]):
+                before = ti.cast(map_rows[s, a, c], ti.f32)
+                map_rows[s, a, c] = ti.cast(before + (ti.cast(rows[n, a, c], ti.f32) - before) * share, ti.f16)
+
+
+@ti.kernel
+def copy_rows(
+    # in:
+    slots: Ints1,   # (N,) rows of the source to take, in order
+    source: Halves3,
+    # out:
+    target: Halves3,  # (>= N, r, c)
+):
+    for n in range(slots.shape[0]):
+        for a in range(source.shape[1]):
+            for c in range(source.shape[2]):
+                target[n, a, c] = source[slots[n], a, c]
+
+
+@ti.kernel
+def project_rows(
+    # in:
+    voxels: ti.i32,
+    rows: Halves3,        # (S, r, c)
+    directions: Floats2,  # (T, c)
+    # out:
+    products: Floats3,    # (S, r, T)
+):
+    for s, a in ti.ndrange(voxels, rows.shape[1]):
+        for t in range(directions.shape[0]):
+            total = 0.0
+            for c in range(rows.shape[2]):
+                total += ti.cast(rows[s, a, c], ti.f32) * directions[t, c]
+            products[s, a, t] = total
+
+
+@ti.kernel
+def take_channels(
+    # in:
+    voxels: ti.i32,
+    rows: Halves3,      # (S, r, c)
+    first: ti.i32,
+    # out:
+    products: Floats3,  # (S, r, T) channels first .. first + T
+):
+    for s, a in ti.ndrange(voxels, rows.shape[1]):
+        for t in range(products.shape[2]):
+            products[s, a, t] = ti.cast(rows[s, a, first + t], ti.f32)
+
+
+@ti.kernel
+def mean_lengths(
+    # in:
+    voxels: ti.i32,
+    rows: Halves3,     # (S, r, c)
+    # out:
+    lengths: Floats1,  # (S,) |E[y]|
+):
+    for s in range(voxels):
+        total = 0.0
+        for c in range(rows.shape[2]):
+            y = ti.cast(rows[s, 0, c], ti.f32)
+            total += y * y
+        lengths[s] = ti.sqrt(total)
+
+
+@ti.kernel
+def solve_rows(
+    # in:
+    rank: ti.template(),
+    voxels: ti.i32,
+    moments: Floats3,   # (S, q + q (q + 1) / 2, 1)
+    weights: Floats1,   # (S,)
+    noise: ti.f32,      # d of Eq. 6 for one feature pixel
+    # in and out:
+    products: Floats3,  # (S, 1 + q, T) products of the rows -> the constant and the coefficients of f_posi
+):
+    for s in range(voxels):
+        L = ti.Vector([0.0] * (rank * rank))
+        at = rank
+        for a in range(rank):  # Cholesky factor, row by row; the diagonal keeps its inverse
+            for b in range(a + 1):
+                value = moments[s, at, 0] - moments[s, a, 0] * moments[s, b, 0]
+                at += 1
+                for k in range(b):
+                    value -= L[a * rank + k] * L[b * rank + k]
+                if a == b:
+                    L[a * rank + a] = 1.0 / ti.sqrt(ti.max(value + noise / weights[s], 1e-12))
+                else:
+                    L[a * rank + b] = value * L[b * rank + b]
+        for t in range(products.shape[2]):
+            F = ti.Vector([0.0] * rank)
+            mean = products[s, 0, t]
+            for a in range(rank):
+                value = products[s, 1 + a, t] - moments[s, a, 0] * mean
+                for k in range(a):
+                    value -= L[a * rank + k] * F[k]
+                F[a] = value * L[a * rank + a]
+            for back in range(rank):
+                a = rank - 1 - back
+                value = F[a]
+                for k in range(a + 1, rank):
+                    value -= L[k * rank + a] * F[k]
+                F[a] = value * L[a * rank + a]
+                mean -= moments[s, a, 0] * F[a]
+                products[s, 1 + a, t] = F[a]
+            products[s, 0, t] = mean
+
+
+@ti.func
+def table_features(t: ti.template(), rank: ti.template(), table: ti.template(), nodes: ti.i32):
+    """Position features at t by trilinear interpolation in a table of nodes^3 rows that spans [-0.5, 0.5]^3."""
+    x = (t + 0.5) * (nodes - 1)
+    corner = ti.math.clamp(ti.floor(x, ti.i32), 0, nodes - 2)
+    r = x - corner
+    f = ti.Vector([0.0] * rank)
+    for o in ti.static(range(8)):
+        step = ti.Vector([o // 4, o // 2 % 2, o % 2])
+        at = corner + step
+        share = 1.0
+        for d in ti.static(range(3)):
+            share *= r[d] if ti.static((o, o // 2, o // 4)[2 - d] % 2 == 1) else 1.0 - r[d]
+        row = (at[0] * nodes + at[1]) * nodes + at[2]
+        for a in ti.static(range(rank)):
+            f[a] += share * table[row, a]
+    return f
+
+
+@ti.kernel
+def query_products(
+    # in:
+    rank: ti.template(),
+    points: Floats2,     # (N, 3) world [m]
+    per_meter: ti.f32,
+    slot: ti.template(),
+    products: Floats3,   # (S, 1 + q, T) constants and coefficients
+    table: Floats2,      # (nodes^3, q)
+    nodes: ti.i32,
+    reach: ti.i32,       # points that no voxel covers take the value of the nearest one within so many voxels
+    # out:
+    values: Floats2,     # (N, T)
+    valid: Bytes1,       # (N,) = 1 where a voxel covers the point
+):
+    for n in range(points.shape[0]):
+        x = row3(points, n) * per_meter
+        weight, covered = 0.0, 0
+        for t in range(values.shape[1]):
+            values[n, t] = 0.0
+        if all_within(x, INDEX_HALF - 1.0):
+            corner = voxel_of(x - 0.5)
+            for o in range(9):
+                ijk, s = corner, -1
+                if o < 8:
+                    ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
+                    s = slot[ijk + INDEX_HALF] - 1
+                elif weight == 0 and reach > 0:
+                    s, ijk = nearest_voxel(x, reach, slot)
+                if s >= 0:
+                    at = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
+                    tent = 1.0
+                    for d in ti.static(range(3)):
+                        tent *= ti.max(1.0 - 2.0 * ti.abs(at[d]), 0.0)
+                    tent = ti.max(tent, 1e-6)  # on the border of the only voxel there is, its value still counts
+                    f = table_features(at, rank, table, nodes)
+                    for t in range(values.shape[1]):
+                        value = products[s, 0, t]
+                        for a in ti.static(range(rank)):
+                            value += f[a] * products[s, 1 + a, t]
+                        values[n, t] = values[n, t] + tent * value
+                    weight += tent
+                    covered += ti.cast(o < 8, ti.i32)
+        valid[n] = ti.cast(covered > 0, ti.u8)
+        for t in range(values.shape[1]):
+            values[n, t] = values[n, t] / ti.max(weight, 1e-12)

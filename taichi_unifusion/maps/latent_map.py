@@ -1,0 +1,261 @@
+"""LatentMap: high-dimensional features of the surface, such as CLIP's, as a LIM (Sec. IV-D)."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from .. import runtime
+from ..encoding import position_encoding
+from ..errors import CapacityError, FrameError, InputError, MapCorrupt
+from ..kernels import fusion, regression
+from ..kernels import latent as kernels
+from ..kernels.voxels import CELLS
+from ..types import FeatureImage, PointCloud
+from .base_map import BaseMap, Integration
+from .frame_blocks import FrameBlocks
+from .property_map import NEAREST_REACH
+from .regressor import CPU_STRIDE, CPU_WORKERS, GPU_STRIDE, _to_device, _window_masks
+from .settings import LatentSettings
+from .voxel_grid import VoxelData, VoxelGrid
+
+GPU_WORKERS = 1024
+NODES = 17                # of the table of position features along an edge of the doubled voxel
+MAX_ELEMENTS = 2**31 - 1  # of an array of Taichi
+MAX_FEATURE = 1e4         # above it half precision, which ends at 65,504, would lose sums
+TEXTS_AT_ONCE = 64
+CHANNELS_AT_ONCE = 16
+
+
+class LatentMap(BaseMap):
+    """A continuous field of feature vectors on the surface, fused from the feature image `name` of point clouds.
+
+        features = LatentMap("clip", channels=512)
+        features.integrate(cloud)                              # cloud.features["clip"]: FeatureImage, (h, w, 512)
+        scores = features.similarity(mesh.vertices, texts)     # (V, n) cosines with texts (n, 512)
+
+    A frame's features are never put on its points or pixels: a voxel takes sums over the few feature pixels that it sees.
+    Rows are kept in half precision, `encoder.rank` of them a voxel. Keywords are those of `LatentSettings`.
+    """
+
+    kind = "latent"
+    settings_type = LatentSettings
+
+    def __init__(self, name: str, channels: int, settings: LatentSettings | None = None, **overrides) -> None:
+        settings = dataclasses.replace(settings or LatentSettings(), **overrides)
+        if channels < 1:
+            raise InputError(f"latent map '{name}': channels must be at least 1, got {channels}")
+        self.name, self.channels, self.settings = name, channels, settings
+        self._rank = rank = settings.encoder.rank - 1  # the mean stands for the first eigenpair, which is nearly constant
+        self._grid = VoxelGrid(rank + rank * (rank + 1) // 2, 1)  # the moments, and weights
+        self._cells = FrameBlocks(self._grid, 0, with_positions=True)
+        self._rows = ti.ndarray(ti.f16, (1, 1 + rank, channels))
+        encoding = position_encoding(settings.encoder)
+        self._cell_features = _to_device(encoding(encoding.nodes(2 * CELLS))[:, 1:])
+        axis = np.linspace(-0.5, 0.5, NODES)
+        self._table = _to_device(encoding(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3))[:, 1:])
+        self._window = ti.ndarray(ti.u32, (27, 2))
+        self._window.from_numpy(_window_masks(settings.margin))
+        self._neighbors = ti.ndarray(ti.i32, (1, 27))
+        on_cpu = self._grid.runtime.device == "cpu"
+        self._workers, self._stride = (CPU_WORKERS, CPU_STRIDE) if on_cpu else (GPU_WORKERS, GPU_STRIDE)
+        self._scratch = self._shared_scratch()
+
+    @classmethod
+    def _restore(cls, name: str, channels: int, settings: LatentSettings) -> LatentMap:
+        return cls(name, channels, settings)
+
+    def _shared_scratch(self) -> tuple:
+        """Scratch for the workers, one for all maps of a runtime: factors, places and feature tiles."""
+        scratch, key = self._grid.runtime.scratch, ("latent", self._workers, self._rank)
+        if key not in scratch:
+            scratch[key] = (ti.field(ti.f32, (self._workers, 1 + self._rank, kernels.ENTRIES)),
+                            ti.field(ti.i32, (self._workers, kernels.ENTRIES)),
+                            ti.field(ti.f32, (self._workers, kernels.CHANNELS, kernels.ENTRIES)))
+        return scratch[key]
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the voxels and their index."""
+        return self._grid.memory_bytes + len(self) * (1 + self._rank) * self.channels * 2
+
+    def integrate(self, cloud: PointCloud) -> Integration:
+        """Fuse the features that a cloud's points see into the map; the cloud in world coordinates.
+
+        Raises as `BaseMap.integrate`, and FrameError where no feature is finite; the map is then unchanged.
+        """
+        runtime.check_alive(self._grid.runtime)
+        features = self._features_of(cloud)
+        if len(cloud) == 0:
+            return Integration(0, 0, len(self))
+        image, usable = self._usable(features.values)
+        blocks = self._cells
+        blocks.touch(cloud.points, self.voxel_size)
+        blocks.bin(cloud.points, cloud.points, self.voxel_size)
+        blocks.compact(1)
+        pixels, seen, weights = self._find_pixels(blocks, features, usable)
+        if not seen.any():
+            return Integration(len(cloud), 0, len(self))
+        slots = np.empty(blocks.count, np.int32)
+        encoded = self._grid.claim(blocks.count, blocks.keys, weights, slots)
+        self._reserve_rows()
+        if blocks.count > self._neighbors.shape[0]:
+            self._neighbors = ti.ndarray(ti.i32, (blocks.count * 5 // 4, 27))
+        regression.find_neighbors(self._grid.stamp, self._grid.block, blocks.frame, blocks.count, blocks.keys, self._neighbors)
+        kernels.fuse_features(self._rank, blocks.count, slots, self._neighbors, blocks.masks, self._window, blocks.starts,
+                              blocks.cells, pixels, self._cell_features, image, float((seen > 0).sum() / seen.sum()),
+                              self._workers, self._stride, *self._scratch, self._rows, self._grid.latents, self._grid.weights)
+        return Integration(len(cloud), encoded, len(self))
+
+    def remove(self, cloud: PointCloud) -> Integration:
+        """Raises InputError: in half precision a frame cannot be taken out again without a trace."""
+        raise InputError(f"latent map '{self.name}': frames cannot be taken out of a map of features; make it anew")
+
+    def _features_of(self, cloud: PointCloud) -> FeatureImage:
+        features = cloud.features.get(self.name)
+        if features is None:
+            raise InputError(f"latent map '{self.name}': the cloud has no feature image '{self.name}', only "
+                             f"{', '.join(sorted(cloud.features)) or 'none'}")
+        if features.values.shape[2] != self.channels:
+            raise InputError(f"latent map '{self.name}': expected {self.channels} channels, the feature image has "
+                             f"{features.values.shape[2]}; another network made it")
+        return features
+
+    def _usable(self, values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """The feature pixels as rows, filled up to whole vectors, and which of them are finite."""
+        rows = values.reshape(-1, self.channels)
+        usable = np.isfinite(rows @ np.ones(self.channels, np.float32))
+        if not usable.any():
+            raise FrameError(f"features '{self.name}': not one pixel is finite; the frame is left out")
+        if not usable.all() or self.channels % kernels.CHANNELS:
+            room = -(-self.channels // kernels.CHANNELS) * kernels.CHANNELS
+            filled = np.zeros((len(rows), room), np.float32)
+            filled[usable, :self.channels] = rows[usable]
+            rows = filled
+        largest = max(float(rows.max()), -float(rows.min()))
+        if largest > MAX_FEATURE:
+            raise FrameError(f"features '{self.name}': hold numbers up to {largest:.3g}; scale them to unit length")
+        return np.ascontiguousarray(rows), usable.astype(np.uint8)
+
+    def _find_pixels(self, blocks: FrameBlocks, features: FeatureImage, usable: NDArray[np.uint8]) -> tuple:
+        """Feature pixel of every cell (M,), points in every pixel (h w,), and the blocks' points that have one (B,)."""
+        pixels, seen = np.empty(blocks.cells.shape[0], np.int32), np.zeros(len(usable), np.int32)
+        weights = np.empty(blocks.count, np.float32)
+        projection = (features.camera.matrix @ features.T_camera_cloud[:3]).astype(np.float32)
+        kernels.find_pixels(blocks.count, blocks.keys, blocks.starts, blocks.masks, blocks.cells, self.voxel_size,
+                            projection, features.camera.width, usable, self.settings.min_points, pixels, seen, weights)
+        runtime.synchronize()
+        return pixels, seen, weights
+
+    def _reserve_rows(self) -> None:
+        """Room in the rows for every slot of the grid."""
+        shape = (self._grid.capacity, 1 + self._rank, self.channels)
+        if self._rows.shape[0] == shape[0]:
+            return
+        if np.prod(shape) > MAX_ELEMENTS:
+            raise CapacityError(f"the map holds {len(self):,} voxels of {1 + self._rank} x {self.channels} numbers, as many as "
+                                "fit into an array: use larger voxels or save the map and start a new one")
+        old, self._rows = self._rows, ti.ndarray(ti.f16, shape)
+        kept = min(old.shape[0], len(self))
+        kernels.copy_rows(np.arange(kept, dtype=np.int32), old, self._rows)
+
+    def similarity(self, points: NDArray, text_embedding: NDArray, return_valid: bool = False):
+        """Cosine (N, n) between the features at points (N, 3) world [m] and text embeddings (n, c); (N,) for a single (c,).
+
+        Texts are multiplied onto the map first, so that a point costs n numbers, not c. The length of a feature is taken to
+        be that of its voxel's mean. `return_valid` also gives where (N,) a voxel covers the point; elsewhere as
+        `PropertyMap.query`. Raises InputError where the texts have another number of channels.
+        """
+        texts = np.ascontiguousarray(np.atleast_2d(text_embedding), dtype=np.float32)
+        if texts.ndim != 2 or texts.shape[1] != self.channels:
+            raise InputError(f"latent map '{self.name}': holds features of {self.channels} channels, the text embedding has "
+                             f"{texts.shape[-1]}; use the text encoder that belongs to the image features")
+        if not np.isfinite(texts).all() or not np.linalg.norm(texts, axis=1).all():
+            raise InputError(f"latent map '{self.name}': a text embedding is zero or not finite")
+        texts = texts / np.linalg.norm(texts, axis=1, keepdims=True)
+        scores, valid = [], None
+        for first in range(0, len(texts), TEXTS_AT_ONCE):
+            part = texts[first:first + TEXTS_AT_ONCE]
+            products = self._solved(lambda out: kernels.project_rows(len(self), self._rows, part, out), len(part))
+            lengths = np.ones(len(self), np.float32)
+            if len(self):
+                kernels.mean_lengths(len(self), self._rows, lengths)
+            values, valid = self._decode(points, products / np.maximum(lengths, 1e-12)[:, None, None])
+            scores.append(values)
+        values = np.concatenate(scores, axis=1)
+        values = values[:, 0] if np.ndim(text_embedding) == 1 else values
+        return (values, valid) if return_valid else values
+
+    def query(self, points: NDArray, return_valid: bool = False):
+        """Features (N, c) float32 at points (N, 3) world [m]; otherwise as `PropertyMap.query`."""
+        values, valid = np.zeros((len(points), self.channels), np.float32), np.zeros(len(points), bool)
+        for first in range(0, self.channels, CHANNELS_AT_ONCE):
+            count = min(CHANNELS_AT_ONCE, self.channels - first)
+            products = self._solved(lambda out: kernels.take_channels(len(self), self._rows, first, out), count)
+            values[:, first:first + count], valid = self._decode(points, products)
+        return (values, valid) if return_valid else values
+
+    def _solved(self, fill, count: int) -> NDArray[np.float32]:
+        """Constants and coefficients (S, 1 + q, count) of the fields whose products with the rows `fill` writes."""
+        runtime.check_alive(self._grid.runtime)
+        products = np.zeros((max(len(self), 1), 1 + self._rank, count), np.float32)
+        if len(self):
+            fill(products)
+            kernels.solve_rows(self._rank, len(self), self._grid.latents, self._grid.weights, self.settings.noise, products)
+        return products
+
+    def _decode(self, points: NDArray, products: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        points = np.ascontiguousarray(points, dtype=np.float32)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"query: points must be (N, 3), got {points.shape}")
+        values, valid = np.zeros((len(points), products.shape[2]), np.float32), np.zeros(len(points), np.uint8)
+        if len(points) and len(self):
+            kernels.query_products(self._rank, points, 1.0 / self.voxel_size, self._grid.slot, products, self._table, NODES,
+                                   NEAREST_REACH, values, valid)
+        return values, valid.astype(bool)
+
+    def merge(self, other: LatentMap) -> None:
+        """Fuse another map of the same settings into this one: exact, up to the rounding of half precision."""
+        self._check_mergeable(other)
+        self._fuse_voxels(other._grid.export(), other._export_rows())
+
+    def _fuse_voxels(self, data: VoxelData, rows: NDArray[np.float16]) -> None:
+        n = len(data.keys)
+        if n:
+            slots = np.empty(n, np.int32)
+            self._grid.claim(n, data.keys, data.weights, slots)
+            self._reserve_rows()
+            kernels.fuse_rows(n, slots, rows, data.weights, self._grid.weights, self._rows)
+            fusion.fuse(self._grid.rows, 1, 0, n, slots, data.latents, data.weights, data.masks, 1.0,
+                        self._grid.latents, self._grid.weights, self._grid.masks)
+
+    def _export_rows(self) -> NDArray[np.float16]:
+        """(N, 1 + q, c) in the order of `VoxelGrid.export`."""
+        order = np.lexsort(self._grid.voxel_keys().T[::-1]).astype(np.int32)
+        rows = np.empty((len(order), 1 + self._rank, self.channels), np.float16)
+        if len(order):
+            kernels.copy_rows(order, self._rows, rows)
+        return rows
+
+    def _tensors(self) -> dict[str, NDArray]:
+        return {**super()._tensors(), "rows": self._export_rows()}
+
+    def _restore_tensors(self, path: str | Path, tensors: dict[str, NDArray]) -> None:
+        data = VoxelData(*(tensors.get(key) for key in ("keys", "latents", "weights", "masks")))
+        self._check_data(path, data)
+        rows, wanted = tensors.get("rows"), (len(data.keys), 1 + self._rank, self.channels)
+        if rows is None or rows.shape != wanted or rows.dtype != np.float16 or not np.isfinite(rows).all():
+            raise MapCorrupt(f"{path}: tensor 'rows' should be {wanted} finite float16; write the map again")
+        self._fuse_voxels(data, rows)
+
+    def _observed(self, cloud: PointCloud) -> NDArray[np.float32]:
+        return cloud.points
+
+    def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
+        raise NotImplementedError
+
+    _encode_points = _encode_cells
