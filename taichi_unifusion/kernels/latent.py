@@ -16,8 +16,9 @@ from .query import nearest_voxel
 from .regression import cell_row, neighbor_step
 from .voxels import INDEX_HALF, Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, all_within, row3, voxel_of
 
-ENTRIES = 512    # cells of a doubled voxel, at most
+ENTRIES = 528    # cells of a doubled voxel, 512 at most; no power of two, whose rows would share cache lines
 CHANNELS = 16    # channels that a worker sums at once
+DIRECTIONS = 4   # texts that a row is multiplied with at once
 Halves3 = ti.types.ndarray(dtype=ti.f16, ndim=3)
 Bytes1 = ti.types.ndarray(dtype=ti.u8, ndim=1)
 
@@ -216,16 +217,20 @@ def project_rows(
     # in:
     voxels: ti.i32,
     rows: Halves3,        # (S, r, c)
-    directions: Floats2,  # (T, c)
+    directions: Floats2,  # (T, c), T a multiple of DIRECTIONS
     # out:
     products: Floats3,    # (S, r, T)
 ):
-    for s, a in ti.ndrange(voxels, rows.shape[1]):
-        for t in range(directions.shape[0]):
-            total = 0.0
-            for c in range(rows.shape[2]):
-                total += ti.cast(rows[s, a, c], ti.f32) * directions[t, c]
-            products[s, a, t] = total
+    for s in range(voxels):
+        for a in range(rows.shape[1]):
+            for part in range(directions.shape[0] // DIRECTIONS):
+                sums = ti.Vector([0.0] * DIRECTIONS)
+                for c in range(rows.shape[2]):
+                    y = ti.cast(rows[s, a, c], ti.f32)
+                    for t in ti.static(range(DIRECTIONS)):
+                        sums[t] += y * directions[part * DIRECTIONS + t, c]
+                for t in ti.static(range(DIRECTIONS)):
+                    products[s, a, part * DIRECTIONS + t] = sums[t]
 
 
 @ti.kernel
@@ -337,9 +342,9 @@ def query_products(
 ):
     for n in range(points.shape[0]):
         x = row3(points, n) * per_meter
-        weight, covered = 0.0, 0
-        for t in range(values.shape[1]):
-            values[n, t] = 0.0
+        weight, covered, found = 0.0, 0, 0
+        slots = ti.Vector([0] * 9)
+        shares = ti.Vector([0.0] * (9 * (1 + rank)))  # of each voxel's constant and coefficients in the value
         if all_within(x, INDEX_HALF - 1.0):
             corner = voxel_of(x - 0.5)
             for o in range(9):
@@ -356,13 +361,17 @@ def query_products(
                         tent *= ti.max(1.0 - 2.0 * ti.abs(at[d]), 0.0)
                     tent = ti.max(tent, 1e-6)  # on the border of the only voxel there is, its value still counts
                     f = table_features(at, rank, table, nodes)
-                    for t in range(values.shape[1]):
-                        value = products[s, 0, t]
-                        for a in ti.static(range(rank)):
-                            value += f[a] * products[s, 1 + a, t]
-                        values[n, t] = values[n, t] + tent * value
+                    shares[found * (1 + rank)] = tent
+                    for a in ti.static(range(rank)):
+                        shares[found * (1 + rank) + 1 + a] = tent * f[a]
+                    slots[found] = s
+                    found += 1
                     weight += tent
                     covered += ti.cast(o < 8, ti.i32)
         valid[n] = ti.cast(covered > 0, ti.u8)
         for t in range(values.shape[1]):
-            values[n, t] = values[n, t] / ti.max(weight, 1e-12)
+            value = 0.0
+            for i in range(found):
+                for a in ti.static(range(1 + rank)):
+                    value += shares[i * (1 + rank) + a] * products[slots[i], a, t]
+            values[n, t] = value / ti.max(weight, 1e-12)

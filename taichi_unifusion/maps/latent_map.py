@@ -180,12 +180,14 @@ class LatentMap(BaseMap):
         scores, valid = [], None
         for first in range(0, len(texts), TEXTS_AT_ONCE):
             part = texts[first:first + TEXTS_AT_ONCE]
-            products = self._solved(lambda out: kernels.project_rows(len(self), self._rows, part, out), len(part))
+            filled = np.zeros((-(-len(part) // kernels.DIRECTIONS) * kernels.DIRECTIONS, self.channels), np.float32)
+            filled[:len(part)] = part
+            products = self._solved(lambda out: kernels.project_rows(len(self), self._rows, filled, out), len(filled))
             lengths = np.ones(len(self), np.float32)
             if len(self):
                 kernels.mean_lengths(len(self), self._rows, lengths)
             values, valid = self._decode(points, products / np.maximum(lengths, 1e-12)[:, None, None])
-            scores.append(values)
+            scores.append(values[:, :len(part)])
         values = np.concatenate(scores, axis=1)
         values = values[:, 0] if np.ndim(text_embedding) == 1 else values
         return (values, valid) if return_valid else values

@@ -104,7 +104,7 @@ class LatentSettings(MapSettings):
 
     voxel_size: float = 0.1
     """Voxel edge in metres; a latent describes a cube of twice this edge."""
-    noise: float = 3.0
+    noise: float = 1.0
     """Observation noise d of the regression (Eq. 6) for one feature pixel, relative to the kernel's variance."""
     fusion: Literal["mean", "information"] = "information"
     """information: the regression runs over all frames at once; there is no other way here, as it costs no more memory."""

@@ -1,0 +1,79 @@
+"""What is asked of a map of features: the relevance of texts, and the best of a list of names, at the vertices of a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..maps import LatentMap
+from ..types import Mesh
+from . import TextEncoder
+from .prompts import LOGIT_SCALE, TEMPLATES, competitors, embed, relevance
+from .regions import MIN_AREA, THRESHOLD, Region, find_regions
+
+UNLABELLED = -1
+POINTS_AT_ONCE = 500_000
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a query found."""
+
+    text: str
+    relevance: NDArray[np.float32]   # (V,) 0..1, 0 where the map knows nothing; 0.5 is a draw with the strongest rival
+    similarity: NDArray[np.float32]  # (V,) cosine
+    regions: tuple[Region, ...]      # best first
+
+    @property
+    def found(self) -> bool:
+        """Whether the query wins anywhere."""
+        return bool(self.regions)
+
+
+def ask(features: LatentMap, mesh: Mesh, encoder: TextEncoder, texts: Sequence[str], *, negatives: Sequence[str] = (),
+        threshold: float = THRESHOLD, min_area: float = MIN_AREA, templates: Sequence[str] = TEMPLATES) -> list[Answer]:
+    """Answers to texts, each against its rivals (see `competitors`) at the vertices of a mesh.
+
+    Raises InputError where the encoder's vectors do not fit the map, or has none for a text.
+    """
+    queries = embed(encoder, texts, templates)
+    rivals, competes = competitors(encoder, queries, negatives, templates)
+    both = np.concatenate([queries, rivals])
+    parts = [_scores(features, mesh.vertices[first:first + POINTS_AT_ONCE], both, competes)
+             for first in range(0, max(len(mesh.vertices), 1), POINTS_AT_ONCE)]
+    similarity, scores = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return [Answer(text, scores[:, i], similarity[:, i],
+                   tuple(find_regions(mesh, scores[:, i], threshold=threshold, min_area=min_area))) for i, text in enumerate(texts)]
+
+
+def _scores(features: LatentMap, points: NDArray, both: NDArray, competes: NDArray) -> tuple[NDArray, NDArray]:
+    """Similarity and relevance (N, n) of n queries, which come before their rivals in `both`."""
+    similarity, known = features.similarity(points, both, return_valid=True)
+    count = len(competes)
+    scores = [relevance(similarity[:, i], similarity[:, count:][:, competes[i]].max(axis=1)) for i in range(count)]
+    return similarity[:, :count], np.where(known[:, None], np.stack(scores, axis=1), np.float32(0))
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """The best of a list of names everywhere."""
+
+    names: tuple[str, ...]
+    labels: NDArray[np.int32]        # (N,) row of names, UNLABELLED where the map knows nothing
+    confidence: NDArray[np.float32]  # (N,) 0..1, softmax of the best
+
+
+def segment(features: LatentMap, points: NDArray, encoder: TextEncoder, names: Sequence[str], *,
+            templates: Sequence[str] = TEMPLATES) -> Segmentation:
+    """The best name at points (N, 3) world [m]; raises InputError for fewer than two names, or as `ask`."""
+    if len(names) < 2 or len(set(names)) < len(names):
+        raise InputError(f"segment: needs at least two names, each once, got {', '.join(names) or 'none'}")
+    similarity, known = features.similarity(points, embed(encoder, names, templates), return_valid=True)
+    labels = similarity.argmax(axis=1).astype(np.int32)
+    best = np.take_along_axis(similarity, labels[:, None].astype(np.int64), axis=1)
+    confidence = 1 / np.exp(LOGIT_SCALE * (similarity - best)).sum(axis=1)
+    return Segmentation(tuple(names), np.where(known, labels, UNLABELLED), np.where(known, confidence, 0).astype(np.float32))
