@@ -7,6 +7,7 @@ Taichi is imported where it is used, so that `--help` is there at once. UNIFUSIO
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import inspect
 import logging
 import os
@@ -21,8 +22,11 @@ from .commands.config import ShowConfig, show_config
 from .commands.evaluate import METRICS, Evaluate
 from .commands.info import Info, info
 from .commands.mesh import ExtractMesh, extract_mesh
+from .commands.query import Query, query
 from .commands.reconstruct import Reconstruct, reconstruct
+from .commands.segment import Segment, segment
 from .commands.transfer import Transfer, transfer
+from .commands.understand import Understand, understand
 from .config import Config, load_config
 from .errors import FileError, UniFusionError
 from .interrupts import INTERRUPTED
@@ -36,6 +40,9 @@ DESCRIPTION = ("RGB-D frames with camera poses in, a coloured surface out.\n\n"
 COMMANDS: dict[str, tuple[type, Callable[..., int] | dict]] = {  # options and function, or a group: its help, its commands
     "reconstruct": (Reconstruct, reconstruct),
     "transfer": (Transfer, transfer),
+    "understand": (Understand, understand),
+    "query": (Query, query),
+    "segment": (Segment, segment),
     "mesh": (ExtractMesh, extract_mesh),
     "info": (Info, info),
     "config": (ShowConfig, show_config),
@@ -101,7 +108,8 @@ def _parse(prog: str, options: type, arguments: list[str]):
     finder.add_argument("--config", nargs="?")
     file = finder.parse_known_args(arguments)[0].config
     settings = load_config(file) if file else Config()
-    required = {field: tyro.MISSING for field in ("format", "out") if field in options.__dataclass_fields__}
+    required = {field.name: tyro.MISSING for field in dataclasses.fields(options)
+                if field.default is field.default_factory is dataclasses.MISSING}
     return tyro.cli(options, prog=prog, args=arguments, default=options(**required, settings=settings))
 
 

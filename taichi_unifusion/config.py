@@ -19,7 +19,7 @@ import yaml
 
 from .errors import ConfigError, InputError
 from .io import read_bytes
-from .maps.settings import PropertySettings, SurfaceSettings
+from .maps.settings import LatentSettings, PropertySettings, SurfaceSettings
 from .preprocessing import PreprocessSettings
 
 MAX_RESOLUTION = 32  # cells a voxel that `SurfaceMap.extract_mesh` takes
@@ -59,6 +59,8 @@ class Config:
     """What else to map, as NAME[=METHOD[:FILE]][,option=value...], for example saliency or style=sketch."""
     property_map: PropertySettings = field(default_factory=lambda: PropertySettings(voxel_size=0.1))
     """The maps of these; a property may say otherwise, as in saliency,voxel_size=0.05."""
+    feature_map: LatentSettings = field(default_factory=LatentSettings)
+    """The map of image-text features."""
     mesh: MeshSettings = field(default_factory=MeshSettings)
     """The mesh."""
 

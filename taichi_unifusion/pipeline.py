@@ -1,4 +1,4 @@
-"""Pipeline: posed frames -> surface LIM, colour LIM, a LIM for every other property -> mesh (Fig. 7, left)."""
+"""Pipeline: posed frames -> surface LIM, colour LIM, a LIM for every other property, features among them -> mesh (Fig. 7)."""
 
 from __future__ import annotations
 
@@ -12,25 +12,31 @@ import numpy as np
 from . import runtime
 from .config import Config
 from .errors import FrameError, InputError, PoseError, UniFusionError
+from .language import ImageEncoder, feature_image
 from .loading import load_ahead
-from .maps import PropertyMap, SurfaceMap
+from .maps import BaseMap, LatentMap, PropertyMap, SurfaceMap
 from .maps.property_group import group_maps
 from .preprocessing import PreprocessSettings, preprocess
 from .properties import SurfaceProperty, make_property
 from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult, name_of
 from .types import Frame, Mesh
 
+FEATURES = "features"  # name of the map of image-text features
+
 
 class Pipeline:
     """Fuses frames into a surface map, a colour map, and a map for every property that the configuration or the caller names.
+
+    With an image encoder also into a map of its features, named FEATURES.
 
         pipeline = Pipeline(Config(properties=("saliency",)))
         pipeline.run(open_dataset("7scenes", path)[::10])
         pipeline.extract_mesh().save("kitchen.ply")
     """
 
-    def __init__(self, config: Config | None = None, properties: Iterable[SurfaceProperty] = ()) -> None:
-        self.config = config or Config()
+    def __init__(self, config: Config | None = None, properties: Iterable[SurfaceProperty] = (),
+                 encoder: ImageEncoder | None = None) -> None:
+        self.config, self.encoder = config or Config(), encoder
         made = (make_property(text, self.config.property_map) for text in self.config.properties)
         self.sources = _by_name((*made, *properties))
         runtime.init(self.config.device, threads=self.config.threads or None)
@@ -39,11 +45,12 @@ class Pipeline:
                            **{name: PropertyMap(name, source.channels, source.settings or self.config.property_map)
                               for name, source in self.sources.items()}}
         self.groups = group_maps(self.properties.values())
+        self.features: LatentMap | None = None  # until the first features say how many channels they have
 
     @property
-    def maps(self) -> dict[str, SurfaceMap | PropertyMap]:
+    def maps(self) -> dict[str, BaseMap]:
         """All maps by name, the surface first."""
-        return {"surface": self.surface, **self.properties}
+        return {"surface": self.surface, **self.properties, **({FEATURES: self.features} if self.features else {})}
 
     def step(self, frame: Frame) -> StepResult:
         """Fuse one frame; a property that the frame lacks, or does not allow to be made, is left out.
@@ -67,6 +74,9 @@ class Pipeline:
             if name := group.name_in(cloud):
                 with clock.stage(name):
                     integrations |= group.integrate(cloud)
+        if FEATURES in cloud.features:
+            with clock.stage(FEATURES):
+                integrations[FEATURES] = self.features.integrate(cloud)
         return StepResult(frame.index, frame.name, len(cloud), integrations, clock.milliseconds, lacking)
 
     def _with_properties(self, frame: Frame, clock: StageClock) -> tuple[Frame, dict[str, str]]:
@@ -79,6 +89,14 @@ class Pipeline:
             except FrameError as error:
                 lacking[name] = str(error)
                 frame = frame.without_image(name)
+        if self.encoder is not None:
+            try:
+                with clock.stage(f"{FEATURES} image"):
+                    frame = frame.with_features(FEATURES, feature_image(self.encoder, frame))
+                channels = frame.features[FEATURES].values.shape[2]
+                self.features = self.features or LatentMap(FEATURES, channels, self.config.feature_map, source=self.encoder.name)
+            except FrameError as error:
+                lacking[FEATURES] = str(error)
         return frame, lacking
 
     def run(self, sequence: Sequence[Frame], *, strict: bool = False, stop: Callable[[], bool] = lambda: False,

@@ -20,8 +20,8 @@ import numpy as np
 from . import __version__, runtime
 from .config import dump_config
 from .errors import FileError, InputError
-from .io import atomic_write, check_writable, write_mesh, write_trajectory
-from .pipeline import Pipeline
+from .io import check_writable, write_mesh, write_text, write_trajectory
+from .pipeline import FEATURES, Pipeline
 from .preview import draw_preview, render_preview, write_png
 from .properties.base import Look
 from .properties.legend import draw_legend, property_mesh, shown_range
@@ -92,8 +92,14 @@ def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, abo
     logger.info("writing to %s", folder.directory)
     for name, saved in pipeline.maps.items():
         folder.write(f"maps/{name}.safetensors", saved.save)
+    if FEATURES not in pipeline.maps:
+        folder.remove(f"maps/{FEATURES}.safetensors")
+        reasons = [step.lacking[FEATURES] for step in run.steps if FEATURES in step.lacking]
+        if reasons:
+            folder.failures.append(InputError(f"there is no map of features: none of {len(run.steps)} frames gave any (first: "
+                                              f"{reasons[0]})"))
     folder.write("trajectory.txt", lambda path: write_trajectory(path, run.trajectory))
-    folder.write("config.yaml", lambda path: _write_text(path, dump_config(pipeline.config)))
+    folder.write("config.yaml", lambda path: write_text(path, dump_config(pipeline.config)))
     logger.info("extracting the mesh")
     extracting = time.perf_counter()
     mesh = folder.attempt(f"{folder.directory}: the mesh could not be extracted", pipeline.extract_mesh)
@@ -105,7 +111,7 @@ def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, abo
     seconds = {"frames": run.seconds, "mesh": extracted - extracting,
                "write": time.perf_counter() - started - (extracted - extracting)}
     metrics = {**(about or {}), **_metrics(folder, pipeline, run, mesh, seconds)}
-    folder.write("metrics.json", lambda path: _write_text(path, json.dumps(metrics, indent=2) + "\n"))
+    folder.write("metrics.json", lambda path: write_text(path, json.dumps(metrics, indent=2) + "\n"))
     return Results(folder.directory, tuple(folder.files), tuple(folder.failures), metrics)
 
 
@@ -224,11 +230,6 @@ def versions() -> dict[str, str]:
 
     return {"taichi_unifusion": __version__, "python": platform.python_version(), "taichi": ".".join(map(str, ti.__version__)),
             "numpy": np.__version__, "platform": platform.platform()}
-
-
-def _write_text(path: Path, text: str) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _size(path: Path) -> int:

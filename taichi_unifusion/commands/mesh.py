@@ -36,7 +36,7 @@ def extract_mesh(options: ExtractMesh) -> int:
     files = [options.out] if options.out else [options.dir / "mesh.ply", options.dir / "mesh.glb"]
     if files[0].suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{files[0]}: a mesh is written as {', '.join(MESH_SUFFIXES)}, not as '{files[0].suffix}'")
-    maps = {path.stem: path for path in sorted((options.dir / "maps").glob("*.safetensors"))}
+    maps = {path.stem: path for path in sorted((options.dir / "maps").glob("*.safetensors")) if path.stem != "features"}
     if "surface" not in maps:
         raise FileError(f"{options.dir}: no maps/surface.safetensors here; give the results folder of `unifusion reconstruct`")
     check_writable(files[0].parent)

@@ -28,7 +28,7 @@ class Query(TextOptions):
     Each text gives query-TEXT.ply, coloured by relevance, query-TEXT.png, and ranked regions in query.json.
     """
 
-    texts: Annotated[Positional[tuple[str, ...]], arg(metavar="TEXT...")] = ()
+    texts: Annotated[Positional[tuple[str, ...]], arg(metavar="TEXT...")]
     """What to look for."""
     negative: Annotated[UseAppendAction[tuple[str, ...]], arg(
         metavar="TEXT", help_behavior_hint="(default: common things; give it once for each)")] = field(default=(), kw_only=True)

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
@@ -16,6 +16,9 @@ from ..datasets import Dataset
 from ..interrupts import INTERRUPTED, stop_on_signal
 from ..terminal import frame_progress, report, summarize
 from .recording import RecordingOptions
+
+if TYPE_CHECKING:
+    from ..language import ImageEncoder
 
 logger = logging.getLogger(__name__)
 
@@ -46,21 +49,22 @@ class Reconstruct(ReconstructOptions):
     settings: Annotated[Config, arg(name="")] = field(default_factory=Config, kw_only=True)
 
 
-def reconstruct(options: Reconstruct) -> int:
-    """Frames -> maps -> mesh -> results folder."""
+def reconstruct(options: Reconstruct, encoder: ImageEncoder | None = None) -> int:
+    """Frames -> maps -> mesh -> results folder; with an image encoder also a map of its features."""
     frames = options.frames()
     from ..results import prepare_results, remove_temporaries
 
     directory = prepare_results(options.out)
     with stop_on_signal(clean_up=lambda: remove_temporaries(directory)) as stop:
-        return _run_and_write(options, frames, directory, stop)
+        return _run_and_write(options, frames, directory, stop, encoder)
 
 
-def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop: Callable[[], bool]) -> int:
+def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop: Callable[[], bool],
+                   encoder: ImageEncoder | None) -> int:
     from ..pipeline import Pipeline
     from ..results import write_results
 
-    pipeline = Pipeline(options.settings)
+    pipeline = Pipeline(options.settings, encoder=encoder)
     with frame_progress(len(frames)) as on_frame:
         run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
     if not run.steps:

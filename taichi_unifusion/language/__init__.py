@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import FrameError, InputError
 from ..types import Frame
 
 IMAGE_ENCODERS = {  # name -> module here, its function, what stands after the colon
@@ -64,6 +64,17 @@ def _make(text: str, encoders: dict[str, tuple[str, str, str]], what: str, optio
     if not where:
         raise InputError(f"{what}: '{name}' needs more, as in {name}:{after.split(':')[0]} ({after})")
     return getattr(import_module(f".{module}", __package__), function)(where, **options)
+
+
+def feature_image(encoder: ImageEncoder, frame: Frame) -> NDArray[np.float32]:
+    """An encoder's features of a frame, (h, w, c), at unit length; FrameError where none is finite, InputError for another shape."""
+    values = np.asarray(encoder.image_features(frame))
+    if values.ndim != 3 or values.dtype.kind != "f" or not values.size:
+        raise InputError(f"{encoder.name}: gives {values.shape} {values.dtype}, not features (h, w, c)")
+    values = unit_length(values)
+    if not np.isfinite(values).any():
+        raise FrameError(f"{encoder.name}: not one feature of frame {frame.name or frame.index} is finite")
+    return values
 
 
 def unit_length(vectors: NDArray) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..preview import render_preview_image
+from ..preview import draw_preview
 from ..types import Mesh, Trajectory
 from .questions import UNLABELLED, Segmentation
 
@@ -50,7 +50,7 @@ def label_mesh(mesh: Mesh, found: Segmentation, labels: Sequence[int], colors: N
 
 def segmentation_picture(mesh: Mesh, found: Segmentation, colors: NDArray, trajectory: Trajectory | None) -> NDArray[np.uint8]:
     """Views of a labelled mesh (H, W, 3) RGB beside the names that occur in it, the commonest first."""
-    picture = render_preview_image(mesh, trajectory=trajectory)
+    picture = draw_preview(mesh, trajectory=trajectory)
     counts = np.bincount(found.labels[found.labels != UNLABELLED], minlength=len(found.names))
     shown = [i for i in np.argsort(-counts, kind="stable") if counts[i]][:picture.shape[0] // SWATCH - 1]
     legend = np.full((picture.shape[0], LEGEND_WIDTH, 3), 255, np.uint8)

@@ -110,6 +110,8 @@ class LatentSettings(MapSettings):
     """information: the regression runs over all frames at once; there is no other way here, as it costs no more memory."""
     encoder: EncoderSettings = field(default_factory=lambda: EncoderSettings(rank=4))
     """The position encoding; a voxel keeps so many numbers a channel: their mean and the eigenpairs from the second on."""
+    source: str = ""
+    """What made the features, as in clip:MODEL; written by the pipeline, and merged only with the same."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

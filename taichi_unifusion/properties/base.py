@@ -14,7 +14,7 @@ from ..maps.settings import PropertySettings
 from ..types import Frame
 from .colormaps import check_colormap
 
-RESERVED = ("surface", "color", "mesh", "preview", "normals")  # files and attributes of every results folder
+RESERVED = ("surface", "color", "mesh", "preview", "normals", "features")  # files and attributes of every results folder
 
 
 @dataclass(frozen=True)
