@@ -50,7 +50,7 @@ class Pipeline:
     @property
     def maps(self) -> dict[str, BaseMap]:
         """All maps by name, the surface first."""
-        return {"surface": self.surface, **self.properties, **({FEATURES: self.features} if self.features else {})}
+        return {"surface": self.surface, **self.properties, **({} if self.features is None else {FEATURES: self.features})}
 
     def step(self, frame: Frame) -> StepResult:
         """Fuse one frame; a property that the frame lacks, or does not allow to be made, is left out.
@@ -94,7 +94,8 @@ class Pipeline:
                 with clock.stage(f"{FEATURES} image"):
                     frame = frame.with_features(FEATURES, feature_image(self.encoder, frame))
                 channels = frame.features[FEATURES].values.shape[2]
-                self.features = self.features or LatentMap(FEATURES, channels, self.config.feature_map, source=self.encoder.name)
+                if self.features is None:
+                    self.features = LatentMap(FEATURES, channels, self.config.feature_map, source=self.encoder.name)
             except FrameError as error:
                 lacking[FEATURES] = str(error)
         return frame, lacking
