@@ -7,6 +7,7 @@ borders are blurred, plus white noise.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -36,6 +37,13 @@ NAMES = {  # class of the house -> its nearest name in LVIS, which has none for 
 }
 
 
+@lru_cache(maxsize=None)
+def rendered_labels(frames: SceneDataset, index: int) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """Classes and objects (H, W) of a frame; rendering costs more than keeping them."""
+    classes, objects = frames.labels(index)
+    return classes.astype(np.int16), objects.astype(np.int16)
+
+
 class HouseFeatures:
     """An image encoder that knows what it sees, and forgets half of it: see above."""
 
@@ -43,9 +51,13 @@ class HouseFeatures:
         self.name = "house"
         self.frames, self.texts, self.name_of_class, self.noise, self.seed = frames, texts, name_of_class, noise, seed
 
+    def with_noise(self, noise: float, seed: int) -> HouseFeatures:
+        """The same with another noise."""
+        return HouseFeatures(self.frames, self.texts, self.name_of_class, noise, seed)
+
     def labels(self, index: int) -> NDArray[np.int64]:
         """Row of the name (H, W) at every pixel, -1 where nothing is."""
-        classes = self.frames.labels(index)[0]
+        classes = rendered_labels(self.frames, index)[0]
         return np.where(classes >= 0, self.name_of_class[classes], -1)
 
     def image_features(self, frame: uf.Frame) -> NDArray[np.float32]:
@@ -79,8 +91,8 @@ def find_noise(features: HouseFeatures, indices: range) -> float:
     low, high = 0.0, 1.0
     for _ in range(7):
         middle = (low + high) / 2
-        trial = HouseFeatures(features.frames, features.texts, features.name_of_class, middle, seed=12345)
-        low, high = (middle, high) if trial.right(indices) > SINGLE_FRAME else (low, middle)
+        right = features.with_noise(middle, seed=12345).right(indices)
+        low, high = (middle, high) if right > SINGLE_FRAME else (low, middle)
     return (low + high) / 2
 
 
@@ -100,7 +112,7 @@ def held_out_points(frames: SceneDataset, features: HouseFeatures, indices: rang
     rays = np.dstack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)])
     found = np.empty((0, 5))
     for index in indices:
-        depth, labels, objects = frames.exact_depth(index), features.labels(index), frames.labels(index)[1]
+        depth, labels, objects = frames.exact_depth(index), features.labels(index), rendered_labels(frames, index)[1]
         kept = (depth > 0.4) & (depth < depth_max) & (labels >= 0)
         T = frames.T_world_camera[index]
         points = (rays[kept] * depth[kept][:, None]) @ T[:3, :3].T + T[:3, 3]

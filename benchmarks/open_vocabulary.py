@@ -87,15 +87,16 @@ def run(options: argparse.Namespace) -> None:
     rows = np.array([names.index(NAMES[name]) for name in frames.class_names])
     mapped = range(0, len(frames), options.every)
     clean = HouseFeatures(frames, texts, rows, 0.0, options.seed)
-    features = HouseFeatures(frames, texts, rows, find_noise(clean, mapped[::8]), options.seed)
+    features = clean.with_noise(find_noise(clean, mapped[::8]), options.seed)
     print(f"{options.path}, {len(mapped)} frames, noise {features.noise:.3f} by coordinate: a single frame is right in "
           f"{features.right(mapped[::4]):.1%} of its pixels, without noise in {clean.right(mapped[::4]):.1%}\n", flush=True)
     pipeline = uf.Pipeline(uf.Config(), encoder=features)
-    result = pipeline.run(frames[::options.every])
+    loaded = [frames[index] for index in mapped]
+    result = pipeline.run(loaded)
     full = LatentMap("features", texts.shape[1], encoder=EncoderSettings(rank=FULL_RANK))
     averages = [Averages(voxel_size) for voxel_size in AVERAGED]
-    for index in mapped:
-        frame = frames[index].with_features("features", features.image_features(frames[index]))
+    for frame in loaded:
+        frame = frame.with_features("features", features.image_features(frame))
         cloud = uf.preprocess(frame).transformed(frame.T_world_camera)
         full.integrate(cloud)
         for average in averages:
@@ -104,14 +105,14 @@ def run(options: argparse.Namespace) -> None:
     known = pipeline.features.similarity(test.points, texts[0], return_valid=True)[1]
     test = HeldOut(test.points[known], test.labels[known], test.objects[known])
     print(table_of_answers(pipeline.features, averages, test, texts, names), "\n", flush=True)
-    print(table_of_memory(pipeline.features, full, test, texts, names), "\n", flush=True)
-    mesh = pipeline.extract_mesh()
-    print(table_of_speed(result, pipeline.features, mesh, encoder), "\n", flush=True)
-    print(table_of_queries(pipeline.features, mesh, encoder, test, frames, names), flush=True)
     if options.out:
         from taichi_unifusion.results import write_results
 
         write_results(options.out, pipeline, result)
+    print(table_of_memory(pipeline.features, full, test, texts, names), "\n", flush=True)
+    mesh = pipeline.extract_mesh()
+    print(table_of_speed(result, pipeline.features, mesh, encoder), "\n", flush=True)
+    print(table_of_queries(pipeline.features, mesh, encoder, test, frames, names), flush=True)
 
 
 def seen_products(cloud: uf.PointCloud, texts: NDArray) -> NDArray[np.float32]:
