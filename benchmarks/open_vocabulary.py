@@ -34,7 +34,7 @@ DEPTH_MAX = 4.5              # [m] of the views that test points come from
 FULL_RANK = 20               # eigenpairs of the map as published
 COMPARED = 2000              # points at which whole features are compared
 BASES = (32, 64, 128)        # directions of low-rank bases
-STAND_INS = ("cornice", "doormat", "knocker")  # no objects
+STAND_INS = ("cornice", "doormat", "knocker")  # of walls, floors and doors: what else is there, no objects
 MIN_POINTS = 30              # test points of an object that counts
 MATCH = 0.25                 # IoU of boxes above which a region is the object
 VERTICES = 500_000           # of the timed query
@@ -202,10 +202,11 @@ def table_of_queries(features: LatentMap, mesh: Mesh, encoder: TextEmbeddings, t
                      names: list[str]) -> str:
     """Every object's name is asked: which of its points answer, which others do, and whether a region's box is the object's."""
     asked = [name for i, name in enumerate(names) if name not in STAND_INS and (test.labels == i).sum() >= MIN_POINTS]
-    answers = {answer.text: answer for answer in ask(features, mesh, encoder, asked)}
+    answers = {answer.text: answer for answer in ask(features, mesh, encoder, asked, negatives=STAND_INS)}
     absent = [name for i, name in enumerate(names) if name not in STAND_INS and not (test.labels == i).any()]
     rows = [["query", "objects", "boxes found", "points found %", "points right %", "regions"]]
-    at_points = {answer.text: answer for answer in ask(features, Mesh(test.points, np.empty((0, 3), np.int32)), encoder, asked)}
+    at_points = {answer.text: answer for answer in ask(features, Mesh(test.points, np.empty((0, 3), np.int32)), encoder, asked,
+                                                          negatives=STAND_INS)}
     boxes_found = boxes = 0
     for name in asked:
         true = test.labels == names.index(name)
@@ -216,7 +217,7 @@ def table_of_queries(features: LatentMap, mesh: Mesh, encoder: TextEmbeddings, t
         boxes, boxes_found = boxes + len(objects), boxes_found + hit
         rows.append([name, str(len(objects)), str(hit), f"{100 * wins[true].mean():.0f}",
                      f"{100 * (wins & true).sum() / max(wins.sum(), 1):.0f}", str(len(answers[name].regions))])
-    quiet = [name for name in absent if not ask(features, mesh, encoder, [name])[0].found] if absent else []
+    quiet = [answer for answer in ask(features, mesh, encoder, absent, negatives=STAND_INS) if not answer.found] if absent else []
     return (format_table(rows) + f"\n{boxes_found} of {boxes} objects have a region with a box IoU of at least {MATCH}; "
             f"{len(quiet)} of {len(absent)} names of things that are not here find nothing")
 

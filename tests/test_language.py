@@ -125,12 +125,21 @@ def test_templates_are_averaged():
         embed(Letters(), ["a", " "])
 
 
-def test_a_query_does_not_compete_with_its_synonym():
+def test_a_query_competes_with_all_but_its_synonyms(monkeypatch):
+    monkeypatch.setattr("taichi_unifusion.language.prompts.NEGATIVES", ("c",))
     queries = Letters().text_features(["a", "b"])
-    rivals, competes = competitors(Letters(), queries, ["a", "b", "c"], ["{}"])
-    assert rivals.shape == (3, 3) and competes.tolist() == [[False, True, True], [True, False, True]]
+    rivals, competes = competitors(Letters(), queries, ["a", "b"], ["{}"])
+    assert rivals.shape == (3, 3) and competes.tolist() == [[True, False, True], [True, True, False]]
     with pytest.raises(InputError, match="nothing is left"):
-        competitors(Letters(), queries[:1], ["aa"], ["{}"])
+        competitors(Letters(), Letters().text_features(["cc"]), [], ["{}"])
+
+
+def test_rivals_from_a_file_are_what_it_holds():
+    file = embeddings(sofa=[1, 0, 0, 0], bed=[0, 1, 0, 0], zebra=[0, 0, 1, 0])
+    rivals, competes = competitors(file, file.text_features(["sofa"]))
+    assert rivals.shape == (3, 4)  # what all have in common, the bed and the sofa, which does not compete with itself
+    np.testing.assert_allclose(rivals[0], np.array([1, 1, 1, 0]) / np.sqrt(3), atol=EXACT)
+    assert competes.sum() == 2
 
 
 def test_relevance_is_a_half_at_a_draw_and_rises():

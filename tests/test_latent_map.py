@@ -218,6 +218,20 @@ def test_shapes_and_empty_maps(target):
     assert np.abs(whole - np.stack([target.similarity(points, text) for text in many], axis=1)).max() < EXACT
 
 
+def test_uncertainty_is_what_noise_does():
+    """Unit features of one direction and white noise: products of the decoded direction with any other spread as predicted."""
+    rng = np.random.default_rng(0)
+    direction = np.zeros(64)
+    direction[0] = 1
+    noisy = direction + rng.standard_normal((3, CAMERA.height, CAMERA.width, 64)) * 0.25
+    noisy /= np.linalg.norm(noisy, axis=3, keepdims=True)
+    target = made(*(view(i, values=noisy[i]) for i in range(3)), noise=100.0)  # smooth: the mean alone
+    points = view(9).points[::5]
+    others = np.eye(64)[1:]
+    spread = target.similarity(points, others).std(axis=1)
+    assert 0.4 < np.median(spread / target.uncertainty(points)) < 1.1  # eight voxels are blended, which shrinks it further
+
+
 def test_a_voxel_takes_an_eighth_of_the_published_bytes():
     target = made(view(0, channels=768))
     assert target.memory_bytes / len(target) <= PUBLISHED_BYTES / 8

@@ -31,7 +31,7 @@ class Query(TextOptions):
     texts: Annotated[Positional[tuple[str, ...]], arg(metavar="TEXT...")]
     """What to look for."""
     negative: Annotated[UseAppendAction[tuple[str, ...]], arg(
-        metavar="TEXT", help_behavior_hint="(default: common things; give it once for each)")] = field(default=(), kw_only=True)
+        metavar="TEXT", help_behavior_hint="(beside common things; give it once for each)")] = field(default=(), kw_only=True)
     """What else may be there: a text is found where it beats all of these."""
     threshold: Annotated[float, arg(metavar="R")] = field(default=0.5, kw_only=True)
     """Relevance, 0..1, that makes a region; 0.5 is a draw with the strongest of what else may be there."""

@@ -64,7 +64,9 @@ class OnnxImageEncoder:
 
     def _as_image(self, raw: NDArray, height: int, width: int) -> NDArray[np.float32]:
         if raw.ndim == 4 and raw.shape[0] == 1:
-            return raw[0] if raw.shape[3] > raw.shape[1] else raw[0].transpose(1, 2, 0)
+            _, first, middle, last = raw.shape  # (h, w, c) or (c, h, w): whichever is of the image's shape
+            channels_last = abs(first * width - middle * height) * last < abs(middle * width - last * height) * first
+            return raw[0] if channels_last else raw[0].transpose(1, 2, 0)
         if raw.ndim == 3 and raw.shape[0] == 1:
             h, w = height // self.patch, width // self.patch
             if raw.shape[1] in (h * w, h * w + 1):

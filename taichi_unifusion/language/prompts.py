@@ -37,16 +37,14 @@ def competitors(encoder: TextEncoder, queries: NDArray[np.float32], negatives: S
                 templates: Sequence[str] = TEMPLATES) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Embeddings (m, c) of what queries (n, c) have to beat, and which of them (n, m) compete with which query.
 
-    Those of `negatives`, or without them of NEGATIVES, as far as a file of embeddings holds them, beside what all its names have
-    in common. One that is nearly the query itself does not compete. Raises InputError where nothing is left.
+    Those of NEGATIVES, as far as a file of embeddings holds them, beside what all its names have in common; and of `negatives`.
+    One that is nearly the query itself does not compete. Raises InputError where nothing is left.
     """
-    if negatives:
-        rivals = embed(encoder, negatives, templates)
-    elif isinstance(encoder, TextEmbeddings):
-        held = [name for name in NEGATIVES if encoder.has(name)]
-        rivals = np.vstack([encoder.anything, *(encoder.text_features(held) if held else ())])
+    if isinstance(encoder, TextEmbeddings):
+        usual = np.vstack([encoder.anything, *(encoder.text_features([name]) for name in NEGATIVES if encoder.has(name))])
     else:
-        rivals = embed(encoder, NEGATIVES, templates)
+        usual = embed(encoder, NEGATIVES, templates)
+    rivals = np.vstack([usual, embed(encoder, negatives, templates)]) if negatives else usual
     competes = queries @ rivals.T < SYNONYM
     if not competes.any(axis=1).all():
         raise InputError("query: nothing is left to compare with; give negatives that mean something else")

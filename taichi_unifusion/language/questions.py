@@ -17,6 +17,7 @@ from .regions import MIN_AREA, THRESHOLD, Region, find_regions
 
 UNLABELLED = -1
 POINTS_AT_ONCE = 500_000
+SURE = 2.0  # standard deviations of noise by which a query has to win
 
 
 @dataclass(frozen=True)
@@ -43,19 +44,27 @@ def ask(features: LatentMap, mesh: Mesh, encoder: TextEncoder, texts: Sequence[s
     queries = embed(encoder, texts, templates)
     rivals, competes = competitors(encoder, queries, negatives, templates)
     both = np.concatenate([queries, rivals])
-    parts = [_scores(features, mesh.vertices[first:first + POINTS_AT_ONCE], both, competes)
+    distances = np.where(competes, np.linalg.norm(queries[:, None] - rivals[None], axis=2), np.inf)
+    parts = [_scores(features, mesh.vertices[first:first + POINTS_AT_ONCE], both, distances)
              for first in range(0, max(len(mesh.vertices), 1), POINTS_AT_ONCE)]
     similarity, scores = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return [Answer(text, scores[:, i], similarity[:, i],
                    tuple(find_regions(mesh, scores[:, i], threshold=threshold, min_area=min_area))) for i, text in enumerate(texts)]
 
 
-def _scores(features: LatentMap, points: NDArray, both: NDArray, competes: NDArray) -> tuple[NDArray, NDArray]:
-    """Similarity and relevance (N, n) of n queries, which come before their rivals in `both`."""
+def _scores(features: LatentMap, points: NDArray, both: NDArray, distances: NDArray) -> tuple[NDArray, NDArray]:
+    """Similarity and relevance (N, n) of n queries, which come before their m rivals in `both`, at `distances` (n, m).
+
+    A rival that is as near as noise makes it, by SURE standard deviations, counts as nearer: seldom seen surface answers seldom.
+    """
     similarity, known = features.similarity(points, both, return_valid=True)
-    count = len(competes)
-    scores = [relevance(similarity[:, i], similarity[:, count:][:, competes[i]].max(axis=1)) for i in range(count)]
-    return similarity[:, :count], np.where(known[:, None], np.stack(scores, axis=1), np.float32(0))
+    margin = SURE * features.uncertainty(points)[:, None]
+    count, scores = len(distances), []
+    for i, away in enumerate(distances):
+        rivals = np.flatnonzero(np.isfinite(away))
+        strongest = (similarity[:, count + rivals] + margin * away[rivals].astype(np.float32)).max(axis=1)
+        scores.append(np.where(known, relevance(similarity[:, i], strongest), np.float32(0)))
+    return similarity[:, :count], np.stack(scores, axis=1)
 
 
 @dataclass(frozen=True)

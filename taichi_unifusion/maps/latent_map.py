@@ -192,6 +192,23 @@ class LatentMap(BaseMap):
         values = values[:, 0] if np.ndim(text_embedding) == 1 else values
         return (values, valid) if return_valid else values
 
+    def uncertainty(self, points: NDArray) -> NDArray[np.float32]:
+        """Standard deviation (N,) of the product of a feature's direction at points (N, 3) world [m] with a unit vector.
+
+        From how much of the length of unit features is left in their mean over w feature pixels: what agrees stays, white noise
+        shrinks. Features that were not of unit length make it wrong.
+        """
+        n = len(self)
+        lengths, weights = np.ones(n, np.float32), np.ones(n, np.float32)
+        if n:
+            kernels.mean_lengths(n, self._rows, lengths)
+            weights = self._grid.weights.to_numpy()[:n]
+        more = np.maximum(weights, 1 + 1e-3)
+        agreeing = np.clip((lengths**2 - 1 / more) / (1 - 1 / more), 1e-3, 1)
+        products = np.zeros((max(n, 1), 1 + self._rank, 1), np.float32)
+        products[:n, 0, 0] = np.sqrt((1 - agreeing) / (agreeing * self.channels * more))
+        return self._decode(points, products)[0][:, 0]
+
     def query(self, points: NDArray, return_valid: bool = False):
         """Features (N, c) float32 at points (N, 3) world [m]; otherwise as `PropertyMap.query`."""
         values, valid = np.zeros((len(points), self.channels), np.float32), np.zeros(len(points), bool)

@@ -1,0 +1,160 @@
+"""understand, query and segment from the command line, and features through the pipeline."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
+
+from taichi_unifusion import Pipeline, cli, load_map
+from taichi_unifusion.io import read_mesh
+from taichi_unifusion.maps import LatentMap
+from taichi_unifusion.results import write_results
+
+COLORS = np.eye(3)  # names are directions of colour here: what is red is "red"
+NAMES = ("red", "green", "blue")
+FOUND = 0.8         # share of the clearly red vertices that must be found
+
+
+class ColorFeatures:
+    """Image features that anybody can check: which of three colours a block of 4 x 4 pixels leans to."""
+
+    name = "colors"
+
+    def image_features(self, frame):
+        height, width = frame.color.shape[:2]
+        blocks = frame.color.reshape(height // 4, 4, width // 4, 4, 3).mean(axis=(1, 3)) / 255
+        return (blocks - blocks.min(axis=2, keepdims=True) + 0.02).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return make_frames(3)
+
+
+@pytest.fixture(scope="module")
+def embeddings(tmp_path_factory):
+    path = tmp_path_factory.mktemp("texts") / "colors.npz"
+    np.savez(path, names=NAMES, vectors=COLORS)
+    return path
+
+
+@pytest.fixture(scope="module")
+def recording(frames, tmp_path_factory):
+    folder = write_folder(tmp_path_factory.mktemp("data") / "recording", frames)
+    (folder / "clip").mkdir()
+    for i, frame in enumerate(frames):
+        np.save(folder / "clip" / f"{i}.npy", ColorFeatures().image_features(frame).astype(np.float16))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(recording, tmp_path_factory):
+    out = tmp_path_factory.mktemp("results") / "made"
+    assert cli.main(["understand", "folder", str(recording), *FLAGS, "--features", f"folder:{recording / 'clip'}",
+                     "--out", str(out)]) == 0
+    return out
+
+
+def ask(made, embeddings, *more) -> int:
+    return cli.main([*more[:1], str(made), *more[1:], "--text", f"embeddings:{embeddings}", "--device", FLAGS[1]])
+
+
+def lean(mesh):
+    """Colour (V, 3) of vertices less its grey part."""
+    color = mesh.attributes["color"]
+    return color - color.min(axis=1, keepdims=True)
+
+
+def test_one_pass_gives_the_map_beside_surface_and_colour(made, recording):
+    features = load_map(made / "maps" / "features.safetensors")
+    assert isinstance(features, LatentMap) and features.channels == 3 and len(features) > 100
+    assert features.settings.source == str(recording / "clip")
+    metrics = json.loads((made / "metrics.json").read_text())
+    assert metrics["frames"]["used"] == 3 and metrics["maps"]["features"]["voxels"] == len(features)
+    assert "color" in read_mesh(made / "mesh.ply").attributes
+
+
+def test_a_query_finds_what_is_there_and_says_what_is_not(made, embeddings, capsys):
+    assert ask(made, embeddings, "query", "red", "--threshold", "0.4", "--json") == 0
+    (answer,) = json.loads(capsys.readouterr().out)
+    mesh = read_mesh(made / "query-red.ply")
+    red = lean(read_mesh(made / "mesh.ply"))
+    clearly = (red[:, 0] > 0.35) & (red[:, 0] > 3 * red[:, 1:].max(axis=1))
+    assert answer["found"] and answer["regions"] and clearly.sum() > 50
+    scores = mesh.attributes["relevance"][:, 0]
+    assert (scores[clearly] > 0.4).mean() > FOUND and (scores[~clearly] > 0.4).mean() < 0.5
+    assert (made / "query-red.png").stat().st_size > 1000 and (made / "query.json").exists()
+    low, high = np.array(answer["regions"][0]["box"])
+    assert (high > low).all() and (low >= mesh.vertices.min(axis=0) - 1e-3).all()
+    assert ask(made, embeddings, "query", "blue", "--negative", "red", "--threshold", "0.99999") == 0
+    assert "blue: not here" in capsys.readouterr().out
+
+
+def test_segmentation_names_every_vertex_and_measures_itself(made, embeddings, tmp_path, capsys):
+    (tmp_path / "labels.txt").write_text("7 red\n8 green\n9 blue\n")
+    mesh = read_mesh(made / "mesh.ply")
+    colors = lean(mesh)
+    clear = np.sort(colors, axis=1)[:, 2] > 0.3 + np.sort(colors, axis=1)[:, 1]
+    truth = mesh.with_attribute("label", np.where(clear, 7 + colors.argmax(axis=1), -1))
+    truth.save(tmp_path / "truth.ply")
+    assert ask(made, embeddings, "segment", "--labels", str(tmp_path / "labels.txt"), "--truth", str(tmp_path / "truth.ply"),
+               "--json") == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["scores"]["overall_accuracy"] > 0.9 and summary["scores"]["points"] == clear.sum()
+    found = read_mesh(made / "segmentation.ply").attributes["label"][:, 0]
+    assert set(np.unique(found)) <= {-1, 7, 8, 9} and (found[clear] == 7 + colors.argmax(axis=1)[clear]).mean() > 0.9
+    assert (made / "segmentation.png").exists()
+    assert ask(made, embeddings, "segment", "--labels", str(tmp_path / "labels.txt"), "--truth", str(tmp_path / "truth.ply")) == 0
+    out = capsys.readouterr().out
+    assert "of the points are right" in out and "segmentation.ply" in out
+
+
+def test_a_finer_mesh_is_still_extracted_beside_features(made, tmp_path):
+    assert cli.main(["mesh", str(made), "--resolution", "2", "--out", str(tmp_path / "a.ply"), "--device", FLAGS[1]]) == 0
+    assert cli.main(["info", str(made)]) == 0
+
+
+def test_wrong_questions_end_with_one_sentence(made, embeddings, tmp_path, capfd):
+    (tmp_path / "labels.txt").write_text("red\nred\n")
+    np.savez(tmp_path / "wide.npz", names=NAMES, vectors=np.eye(3, 5))
+    wide = f"embeddings:{tmp_path / 'wide.npz'}"
+    for arguments, message in (
+            (["query", str(made), "red"], "give the text encoder"),
+            (["query", str(tmp_path), "red", "--text", f"embeddings:{embeddings}"], "no maps/features.safetensors"),
+            (["query", str(made), "mauve", "--text", f"embeddings:{embeddings}"], "has no vector for 'mauve'"),
+            (["query", str(made), "red", "--text", wide], "3 channels"),
+            (["query", str(made), "red", "--text", "letters:x"], "clip, onnx, embeddings"),
+            (["segment", str(made), "--labels", str(tmp_path / "labels.txt"), "--text", f"embeddings:{embeddings}"], "twice"),
+            (["segment", str(made), "--labels", str(tmp_path / "none.txt"), "--text", f"embeddings:{embeddings}"], "no such file"),
+            (["understand", "synthetic", "--features", "klip:x", "--out", str(tmp_path / "o")], "clip, onnx, folder")):
+        assert cli.main(arguments) == 2
+        error = capfd.readouterr().err
+        assert message in error and "Traceback" not in error
+
+
+def test_frames_without_features_still_give_their_surface(frames, tmp_path):
+    class Sometimes(ColorFeatures):
+        def image_features(self, frame):
+            values = super().image_features(frame)
+            return values if frame.index == 1 else np.full_like(values, np.nan)
+
+    pipeline = Pipeline(CONFIG, encoder=Sometimes())
+    run = pipeline.run(frames)
+    assert [("features" in step.integrations, "features" in step.lacking) for step in run.steps] == [
+        (False, True), (True, False), (False, True)]
+    assert len(pipeline.features) > 0 and not run.skipped
+
+    class Never(ColorFeatures):
+        def image_features(self, frame):
+            return np.full((3, 4, 5), np.nan, np.float32)
+
+    pipeline = Pipeline(replace(CONFIG), encoder=Never())
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "features.safetensors").write_text("of an earlier run")
+    results = write_results(tmp_path, pipeline, pipeline.run(frames[:1]))
+    assert any("no map of features" in str(error) for error in results.failures) and (tmp_path / "mesh.ply").exists()
+    assert not (tmp_path / "maps" / "features.safetensors").exists()
