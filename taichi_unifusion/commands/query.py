@@ -57,14 +57,15 @@ def query(options: Query) -> int:
     answers = ask(understood.features, understood.mesh, encoder, options.texts, negatives=options.negative,
                   threshold=options.threshold, min_area=options.min_area, templates=options.templates)
     from ..io import write_mesh
-    from ..language.pictures import heat_mesh
+    from ..language.pictures import cameras_that_see, heat_mesh
     from ..preview import render_preview
 
     listed = []
     for answer in answers:
         mesh, name = heat_mesh(understood.mesh, answer.relevance), f"query-{file_name(answer.text)}"
         folder.write(f"{name}.ply", lambda path, mesh=mesh: write_mesh(path, mesh))
-        folder.write(f"{name}.png", lambda path, mesh=mesh: render_preview(mesh, path, trajectory=understood.trajectory))
+        cameras = cameras_that_see(understood.trajectory, answer.regions[0].centroid) if answer.found else understood.trajectory
+        folder.write(f"{name}.png", lambda path, mesh=mesh, cameras=cameras: render_preview(mesh, path, trajectory=cameras))
         listed.append({"mesh": f"{name}.ply", "picture": f"{name}.png", **describe(answer, options.top)})
     text = json.dumps(listed, indent=2)
     folder.write("query.json", lambda path: write_text(path, text + "\n"))

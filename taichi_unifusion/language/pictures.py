@@ -13,10 +13,11 @@ from ..preview import draw_preview
 from ..types import Mesh, Trajectory
 from .questions import UNLABELLED, Segmentation
 
-HEAT = ((0.0, (0.30, 0.30, 0.34)), (0.35, (0.42, 0.26, 0.40)), (0.5, (0.78, 0.26, 0.24)), (0.75, (0.96, 0.60, 0.14)),
+HEAT = ((0.0, (0.46, 0.46, 0.50)), (0.35, (0.48, 0.30, 0.42)), (0.5, (0.78, 0.26, 0.24)), (0.75, (0.96, 0.60, 0.14)),
         (1.0, (1.0, 0.92, 0.35)))  # relevance -> RGB: grey where nothing is, bright where it wins
 NOTHING = (0.35, 0.35, 0.35)  # RGB of a vertex without a label
 GOLDEN = 0.618033988749895    # steps of hue that stay apart for any number of labels
+NEAR = 1.0                    # [m] a camera nearer than this shows too little around
 SWATCH, LEGEND_WIDTH = 26, 260  # [pixels]
 
 
@@ -30,6 +31,18 @@ def heat_mesh(mesh: Mesh, relevance: NDArray) -> Mesh:
     shaded = np.clip(heat * (0.65 + 0.6 * shade), 0, 1)
     plain = Mesh(mesh.vertices, mesh.faces, mesh.normals)
     return plain.with_attribute("color", shaded).with_attribute("relevance", relevance)
+
+
+def cameras_that_see(trajectory: Trajectory | None, point: NDArray, count: int = 3) -> Trajectory | None:
+    """The poses that have a point (3,) world [m] nearest to the middle of their picture, not too close."""
+    if trajectory is None or not len(trajectory):
+        return trajectory
+    T_camera_world = np.linalg.inv(trajectory.T_world_camera)
+    seen = T_camera_world[:, :3, :3] @ point + T_camera_world[:, :3, 3]
+    distance = np.linalg.norm(seen, axis=1)
+    best = np.argsort(np.arccos(np.clip(seen[:, 2] / np.maximum(distance, 1e-9), -1, 1)) + (distance < NEAR), kind="stable")[:count]
+    best = np.sort(best)
+    return Trajectory(trajectory.timestamps[best], trajectory.T_world_camera[best])
 
 
 def label_colors(count: int) -> NDArray[np.float64]:
