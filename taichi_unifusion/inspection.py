@@ -59,7 +59,7 @@ def _describe_map(file: Path) -> list[str]:
         return [manifest["name"], kind, f"{len(tensors['keys']):,}", f"{100 * settings['voxel_size']:g} cm",
                 format_bytes(file.stat().st_size),
                 f"Matern-7/2, rank {encoder['rank']} of {encoder['anchors']}, seed {encoder['seed']}",
-                manifest["fusion"], str(manifest["format_version"])]
+                settings["fusion"], str(manifest["format_version"])]
     except (KeyError, TypeError) as error:
         raise MapCorrupt(f"{file}: its manifest does not describe a map ({error}); write it again") from error
 
