@@ -1,7 +1,7 @@
 """Features of the rendered house that are right and noisy by design, and points on its surface with their true names.
 
-A pixel's feature is the real CLIP text vector of the class seen there, averaged over a feature pixel and its neighbours, so that
-borders are blurred, plus white noise.
+A pixel's feature is the real CLIP text vector of the class seen there, averaged over a feature pixel and its neighbours, so
+that borders are blurred, plus white noise.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ NAMES = {  # class of the house -> its nearest name in LVIS, which has none for 
     "CoffeeTable": "coffee table", "CookingBench": "stove", "Curtain": "curtain", "Dumbbell": "dumbbell",
     "DeskPortraitA": "painting", "DeskPortraitB": "painting", "DeskPortraitC": "painting", "DeskPortraitD": "painting",
     "Door": "knocker", "FitnessEquipment": "barbell", "FloorB": "doormat", "FoldingDoor": "knocker", "Handle": "doorknob",
-    "HouseWallB": "cornice", "KitchenCabinet": "cupboard", "KitchenTable": "kitchen table", "KitchenUtensils": "cooking utensil",
+    "HouseWallB": "cornice", "KitchenCabinet": "cupboard", "KitchenTable": "kitchen table",
+    "KitchenUtensils": "cooking utensil",
     "LightC": "lamp", "NightStand": "drawer", "PortraitA": "painting", "PortraitB": "painting", "PortraitC": "painting",
-    "PortraitD": "painting", "PortraitE": "painting", "Rangehood": "vent", "ReadingDesk": "desk", "Refrigerator": "refrigerator",
+    "PortraitD": "painting", "PortraitE": "painting", "Rangehood": "vent", "ReadingDesk": "desk",
+    "Refrigerator": "refrigerator",
     "RoomWall": "cornice", "RoomWindow": "window box", "SeasoningBox": "condiment", "SecurityCamera": "webcam",
     "ShoeRack": "shoe", "SofaC": "sofa", "TV": "television set", "TVCabinet": "cabinet",
     "Tablet": "monitor (computer equipment) computer monitor", "Tableware": "dish", "Trash": "trash can", "Vase": "vase",
@@ -47,7 +49,8 @@ def rendered_labels(frames: SceneDataset, index: int) -> tuple[NDArray[np.int16]
 class HouseFeatures:
     """An image encoder that knows what it sees, and forgets half of it: see above."""
 
-    def __init__(self, frames: SceneDataset, texts: NDArray[np.float32], name_of_class: NDArray[np.int64], noise: float, seed: int) -> None:
+    def __init__(self, frames: SceneDataset, texts: NDArray[np.float32], name_of_class: NDArray[np.int64], noise: float,
+                 seed: int) -> None:
         self.name = "house"
         self.frames, self.texts, self.name_of_class, self.noise, self.seed = frames, texts, name_of_class, noise, seed
 

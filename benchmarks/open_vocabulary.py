@@ -2,8 +2,9 @@
 
     python benchmarks/open_vocabulary.py PATH/aws-small-house PATH/clip-text-embeddings --path living --every 12
 
-Features are those of house_features.py: real CLIP text vectors of what is seen, 80 x 60 a frame, blurred, with noise that makes a
-single frame right in about half of its pixels. The map is asked with the same vectors at points of views that were not mapped.
+Features are those of house_features.py: real CLIP text vectors of what is seen, 80 x 60 a frame, blurred, with noise that makes
+a single frame right in about half of its pixels. The map is asked with the same vectors at points of views that
+were not mapped.
 """
 
 from __future__ import annotations
@@ -136,7 +137,8 @@ def table_of_answers(features: LatentMap, averages: list[Averages], test: HeldOu
     rows = [[f"at {len(test.points):,} points", "accuracy %", "mean accuracy %", "mIoU %"]]
     for method, labels in methods.items():
         score = evaluate_segmentation(labels, test.labels, names=dict(enumerate(names)))
-        rows.append([method, *(f"{100 * value:.1f}" for value in (score.overall_accuracy, score.mean_accuracy, score.mean_iou))])
+        values = score.overall_accuracy, score.mean_accuracy, score.mean_iou
+        rows.append([method, *(f"{100 * value:.1f}" for value in values)])
     return format_table(rows)
 
 
@@ -224,7 +226,7 @@ def table_of_queries(features: LatentMap, mesh: Mesh, encoder: TextEmbeddings, t
         boxes, boxes_found = boxes + len(objects), boxes_found + hit
         rows.append([name, str(len(objects)), str(hit), f"{100 * wins[true].mean():.0f}",
                      f"{100 * (wins & true).sum() / max(wins.sum(), 1):.0f}", str(len(answers[name].regions))])
-    quiet = [answer for answer in ask(features, mesh, encoder, absent, negatives=STAND_INS) if not answer.found] if absent else []
+    quiet = [each for each in (ask(features, mesh, encoder, absent, negatives=STAND_INS) if absent else ()) if not each.found]
     return (format_table(rows) + f"\n{boxes_found} of {boxes} objects have a region with a box IoU of at least {MATCH}; "
             f"{len(quiet)} of {len(absent)} names of things that are not here find nothing")
 

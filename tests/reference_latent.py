@@ -1,7 +1,7 @@
 """Slow float64 twins of the kernels of feature maps; a twin has the name of its kernel. Positions are in voxel units.
 
-A feature is seen by a cell (its mean point falls into a pixel); a voxel's sums run over the cells of its doubled box, all frames
-at once: what the kernels keep as running means must be the same regression.
+A feature is seen by a cell (its mean point falls into a pixel); a voxel's sums run over the cells of its doubled box, all
+frames at once: what the kernels keep as running means must be the same regression.
 """
 
 from __future__ import annotations
@@ -46,10 +46,11 @@ def fuse_features(encoder, frames, minimum, margin):
 
 
 def solve_rows(f, weights, products, noise):
-    """Constant and coefficients (1 + q, T) of the regression of products (N, T) about their mean: ridge with a free constant."""
+    """Constant and coefficients (1 + q, T) of the ridge regression of products (N, T) about their mean."""
     mean_f, mean = weights @ f / weights.sum(), weights @ products / weights.sum()
     centered = f - mean_f
-    F = np.linalg.solve((centered.T * weights) @ centered + noise * np.eye(f.shape[1]), (centered.T * weights) @ (products - mean))
+    gram = (centered.T * weights) @ centered
+    F = np.linalg.solve(gram + noise * np.eye(f.shape[1]), (centered.T * weights) @ (products - mean))
     return np.vstack([mean - mean_f @ F, F])
 
 

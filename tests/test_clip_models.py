@@ -93,7 +93,8 @@ def test_crops_lie_at_their_pixels(folder):
 def test_a_batch_gives_what_each_gives_alone(folder):
     model = make_text_encoder(f"clip:{folder}", device="cpu")
     words = [f"word {chr(97 + i % 26)}{i}" for i in range(2 * clip.BATCH + 3)]
-    assert np.abs(model.text_features(words)[[0, 17, 34]] - model.text_features([words[0], words[17], words[34]])).max() < BATCHED
+    some = [0, 17, 34]
+    assert np.abs(model.text_features(words)[some] - model.text_features([words[i] for i in some])).max() < BATCHED
     images = np.stack([model.normalized(picture(seed), 64, 48) for seed in range(3)])
     assert np.abs(model.dense_features(images)[1] - model.dense_features(images[1:2])[0]).max() < BATCHED
     assert embed(model, ["sofa"]).shape == (1, model.text_features(["sofa"]).shape[1])

@@ -91,8 +91,9 @@ def test_wrong_embeddings_are_said(tmp_path):
     np.savez(tmp_path / "objects.npz", names=np.array(["bed", None], object), vectors=np.eye(2))
     np.save(tmp_path / "alone.npy", np.eye(2))
     (tmp_path / "text.npz").write_text("no array")
-    for name, message in (("nan.npz", "'lamp' is zero or not finite"), ("more.npz", "one vector a name"), ("other.npz", "names"),
-                          ("objects.npz", "can run code"), ("alone.npy", "--names"), ("text.npz", "not arrays"),
+    for name, message in (("nan.npz", "'lamp' is zero or not finite"), ("more.npz", "one vector a name"), 
+                          ("other.npz", "names"), ("objects.npz", "can run code"), ("alone.npy", "--names"),
+                          ("text.npz", "not arrays"),
                           ("absent.npz", "no such file")):
         with pytest.raises((InputError, FileError), match=message):
             read_embeddings(tmp_path / name)
@@ -156,7 +157,8 @@ def sheets(*places: float) -> Mesh:
     x, y = np.meshgrid(np.linspace(0, 1, 10), np.linspace(0, 1, 10), indexing="ij")
     one = np.column_stack([x.ravel(), y.ravel(), np.zeros(100)])
     corner = (np.arange(9)[:, None] * 10 + np.arange(9)).ravel()
-    faces = np.concatenate([np.column_stack([corner, corner + 10, corner + 1]), np.column_stack([corner + 1, corner + 10, corner + 11])])
+    faces = np.concatenate([np.column_stack([corner, corner + 10, corner + 1]),
+                            np.column_stack([corner + 1, corner + 10, corner + 11])])
     return Mesh(np.concatenate([one + [place, 0, 0] for place in places]).astype(np.float32),
                 np.concatenate([faces + 100 * i for i in range(len(places))]).astype(np.int32))
 
@@ -255,7 +257,8 @@ class Payload:
 
 def test_damaged_and_dangerous_files_cost_the_frame_only(tmp_path):
     marker = tmp_path / "was-run"
-    files = {name: tmp_path / name for name in ("cut.npy", "text.npy", "pickle.npy", "cut.npz", "two.npz", "flat.npy", "pickle.pt")}
+    names = ("cut.npy", "text.npy", "pickle.npy", "cut.npz", "two.npz", "flat.npy", "pickle.pt")
+    files = {name: tmp_path / name for name in names}
     np.save(files["cut.npy"], stored())
     files["cut.npy"].write_bytes(files["cut.npy"].read_bytes()[:-9])
     files["text.npy"].write_text("no array")

@@ -12,7 +12,7 @@ import taichi as ti
 
 from taichi_unifusion import PinholeCamera, PointCloud, load_map
 from taichi_unifusion.errors import FrameError, InputError, MapCorrupt
-from taichi_unifusion.kernels import latent as kernels
+from taichi_unifusion.kernels import latent, latent_query
 from taichi_unifusion.map_files import read_map, write_map
 from taichi_unifusion.maps import LatentMap
 from taichi_unifusion.types import FeatureImage
@@ -72,7 +72,8 @@ def target(clouds):
 
 
 def test_every_kernel_has_a_twin_of_its_name():
-    names = {name for name, value in vars(kernels).items() if getattr(value, "_is_wrapped_kernel", False)}
+    names = {name for module in (latent, latent_query) for name, value in vars(module).items()
+             if getattr(value, "_is_wrapped_kernel", False)}
     assert names and {name for name in names if not hasattr(twin, name)} == set()
 
 
@@ -104,23 +105,24 @@ def test_the_map_is_the_regression_over_all_frames(clouds, target):
 def test_small_kernels_equal_their_twins():
     rng = np.random.default_rng(0)
     rows = rng.standard_normal((7, 4, 20)).astype(np.float16)
-    directions = rng.standard_normal((kernels.DIRECTIONS, 20)).astype(np.float32)
-    products = np.empty((7, 4, kernels.DIRECTIONS), np.float32)
-    kernels.project_rows(7, rows, directions, products)
+    directions = rng.standard_normal((latent_query.DIRECTIONS, 20)).astype(np.float32)
+    products = np.empty((7, 4, latent_query.DIRECTIONS), np.float32)
+    latent_query.project_rows(7, rows, directions, products)
     np.testing.assert_allclose(products, twin.project_rows(rows, directions), atol=1e-4)
     channels = np.empty((7, 4, 6), np.float32)
-    kernels.take_channels(7, rows, 5, channels)
+    latent_query.take_channels(7, rows, 5, channels)
     assert (channels == twin.take_channels(rows, 5, 6)).all()
     lengths = np.empty(7, np.float32)
-    kernels.mean_lengths(7, rows, lengths)
+    latent_query.mean_lengths(7, rows, lengths)
     np.testing.assert_allclose(lengths, twin.mean_lengths(rows), rtol=1e-5)
     slots, taken = np.array([3, 0, 6], np.int32), np.empty((3, 4, 20), np.float16)
-    kernels.copy_rows(slots, rows, taken)
+    latent.copy_rows(slots, rows, taken)
     assert (taken == twin.copy_rows(rows, slots)).all()
     fused = rows.copy()
-    kernels.fuse_rows(3, slots, taken[::-1].copy(), np.full(3, 2, np.float32), np.ones(7, np.float32), fused)
+    latent.fuse_rows(3, slots, taken[::-1].copy(), np.full(3, 2, np.float32), np.ones(7, np.float32), fused)
     ti.sync()
-    np.testing.assert_allclose(fused[slots], twin.fuse_rows(rows[slots].astype(float), 1, taken[::-1].astype(float), 2), atol=3e-3)
+    wanted = twin.fuse_rows(rows[slots].astype(float), 1, taken[::-1].astype(float), 2)
+    np.testing.assert_allclose(fused[slots], wanted, atol=3e-3)
 
 
 def test_a_constant_comes_back_and_a_text_meets_it():
@@ -201,7 +203,8 @@ def test_unusable_features_leave_the_map_as_it_was(clouds):
     assert (answers(target) == before).all()
 
 
-@pytest.mark.parametrize("text, message", [(np.ones(21), "20 channels"), (np.zeros(20), "zero"), (np.full(20, np.nan), "finite")])
+@pytest.mark.parametrize("text, message", [(np.ones(21), "20 channels"), (np.zeros(20), "zero"),
+                                           (np.full(20, np.nan), "finite")])
 def test_texts_that_do_not_fit_are_refused(target, text, message):
     with pytest.raises(InputError, match=message):
         target.similarity(np.zeros((1, 3)), text)

@@ -52,7 +52,8 @@ def image_network(path: Path, shape, tokens: bool = False) -> Path:
 
 def text_network(path: Path, kind=INT64, batch="n", mask: bool = False) -> Path:
     """The mean of the tokens' vectors."""
-    nodes = [("Gather", ["table", "input_ids"], ["words"], {}), ("ReduceMean", ["words"], ["result"], {"axes": [1], "keepdims": 0})]
+    nodes = [("Gather", ["table", "input_ids"], ["words"], {}),
+             ("ReduceMean", ["words"], ["result"], {"axes": [1], "keepdims": 0})]
     inputs = [("input_ids", kind, [batch, 77])] + ([("attention_mask", kind, [batch, 77])] if mask else [])
     return write(path, nodes, {"table": TABLE}, inputs, [batch, CHANNELS])
 

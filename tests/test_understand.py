@@ -101,14 +101,14 @@ def test_segmentation_names_every_vertex_and_measures_itself(made, embeddings, t
     clear = np.sort(colors, axis=1)[:, 2] > 0.3 + np.sort(colors, axis=1)[:, 1]
     truth = mesh.with_attribute("label", np.where(clear, 7 + colors.argmax(axis=1), -1))
     truth.save(tmp_path / "truth.ply")
-    assert ask(made, embeddings, "segment", "--labels", str(tmp_path / "labels.txt"), "--truth", str(tmp_path / "truth.ply"),
-               "--json") == 0
+    arguments = ("segment", "--labels", str(tmp_path / "labels.txt"), "--truth", str(tmp_path / "truth.ply"))
+    assert ask(made, embeddings, *arguments, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["scores"]["overall_accuracy"] > 0.9 and summary["scores"]["points"] == clear.sum()
     found = read_mesh(made / "segmentation.ply").attributes["label"][:, 0]
     assert set(np.unique(found)) <= {-1, 7, 8, 9} and (found[clear] == 7 + colors.argmax(axis=1)[clear]).mean() > 0.9
     assert (made / "segmentation.png").exists()
-    assert ask(made, embeddings, "segment", "--labels", str(tmp_path / "labels.txt"), "--truth", str(tmp_path / "truth.ply")) == 0
+    assert ask(made, embeddings, *arguments) == 0
     out = capsys.readouterr().out
     assert "of the points are right" in out and "segmentation.ply" in out
 
@@ -129,7 +129,7 @@ def test_wrong_questions_end_with_one_sentence(made, embeddings, tmp_path, capfd
             (["query", str(made), "red", "--text", wide], "3 channels"),
             (["query", str(made), "red", "--text", "letters:x"], "clip, onnx, embeddings"),
             (["segment", str(made), "--labels", str(tmp_path / "labels.txt"), "--text", f"embeddings:{embeddings}"], "twice"),
-            (["segment", str(made), "--labels", str(tmp_path / "none.txt"), "--text", f"embeddings:{embeddings}"], "no such file"),
+            (["segment", str(made), "--labels", str(tmp_path / "none"), "--text", f"embeddings:{embeddings}"], "no such file"),
             (["understand", "synthetic", "--features", "klip:x", "--out", str(tmp_path / "o")], "clip, onnx, folder")):
         assert cli.main(arguments) == 2
         error = capfd.readouterr().err

@@ -125,7 +125,8 @@ def _tables(summary: dict[str, Any], files: list[str]) -> str:
     if "scores" in summary:
         scores = summary["scores"]
         rows = [["class", "IoU %", "accuracy %", "points"]]
-        rows += [[c["name"], f"{100 * c['iou']:.1f}", f"{100 * c['accuracy']:.1f}", f"{c['points']:,}"] for c in scores["classes"]]
-        rows.append(["mean", f"{100 * scores['mean_iou']:.1f}", f"{100 * scores['mean_accuracy']:.1f}", f"{scores['points']:,}"])
+        mean = {"name": "mean", "iou": scores["mean_iou"], "accuracy": scores["mean_accuracy"], "points": scores["points"]}
+        rows += [[each["name"], f"{100 * each['iou']:.1f}", f"{100 * each['accuracy']:.1f}", f"{each['points']:,}"]
+                 for each in (*scores["classes"], mean)]
         text += f"\n\n{format_table(rows)}\n{100 * scores['overall_accuracy']:.1f} % of the points are right"
     return f"{text}\n\n{', '.join(files)}"

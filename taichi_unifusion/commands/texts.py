@@ -52,7 +52,7 @@ class TextOptions:
 
         text = self.text or (source if source.startswith("clip:") else None)
         if text is None:
-            raise InputError(f"{self.dir}: its features come from '{source or 'an unknown network'}'; give the text encoder that "
+            raise InputError(f"{self.dir}: its features come from {source or 'an unknown network'}; give the text encoder that "
                              "belongs to them, with --text clip:MODEL, onnx:FILE.onnx or embeddings:FILE")
         kind = text.partition(":")[0]
         options = {"clip": {"download": self.download, "device": self.device},

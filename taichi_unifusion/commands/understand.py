@@ -16,7 +16,7 @@ from .reconstruct import Reconstruct, ReconstructOptions, reconstruct
 class UnderstandOptions(ReconstructOptions):
     """Map image-text features (CLIP and its kin) onto the surface, beside its colour, in one pass; then ask with `query`.
 
-    Example: unifusion understand 7scenes my/redkitchen --every 10 --features clip:my/clip-vit-base-patch16 --out results/kitchen
+    Example: unifusion understand 7scenes my/redkitchen --every 10 --features clip:models/clip-vit-b16 --out results/kitchen
 
     Settings that `unifusion config --help` explains are options here too, for example --feature-map.voxel-size 0.05.
     """

@@ -67,7 +67,8 @@ def _make(text: str, encoders: dict[str, tuple[str, str, str]], what: str, optio
 
 
 def feature_image(encoder: ImageEncoder, frame: Frame) -> NDArray[np.float32]:
-    """An encoder's features of a frame, (h, w, c), at unit length; FrameError where none is finite, InputError for another shape."""
+    """An encoder's features (h, w, c) of a frame at unit length; FrameError where none is finite, InputError for another
+    shape."""
     values = np.asarray(encoder.image_features(frame))
     if values.ndim != 3 or values.dtype.kind != "f" or not values.size:
         raise InputError(f"{encoder.name}: gives {values.shape} {values.dtype}, not features (h, w, c)")

@@ -50,7 +50,8 @@ class ClipModel:
             raise
         except Exception as error:  # OSError, ValueError, and what safetensors and the tokenizers have
             line = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
-            hint = "" if Path(name).exists() or download else "; --download fetches a model of that name from the Hugging Face hub"
+            hint = "; --download fetches a model of that name from the Hugging Face hub"
+            hint = "" if Path(name).exists() or download else hint
             raise FileError(f"{name}: no CLIP or SigLIP model that transformers can load here ({line}){hint}") from None
         self.kind, self.model = config.model_type, model.to(self.device).eval()
         self.patch = config.vision_config.patch_size
@@ -89,8 +90,8 @@ class ClipModel:
         with self.torch.inference_mode():
             vision = self.model.vision_model
             out = vision(pixel_values=self._tensor(images), output_hidden_states=True, interpolate_pos_encoding=True)
-            tokens = self._values_of_head(vision, out.last_hidden_state) if self.kind == "siglip" else self._values_of_last_layer(
-                vision, out.hidden_states[-2])
+            tokens = (self._values_of_head(vision, out.last_hidden_state) if self.kind == "siglip"
+                      else self._values_of_last_layer(vision, out.hidden_states[-2]))
         return tokens.float().cpu().numpy().reshape(n, height // self.patch, width // self.patch, -1)
 
     def _values_of_last_layer(self, vision: Any, hidden: Any) -> Any:
@@ -211,7 +212,8 @@ def _import_torch():
         import torch
         import transformers
     except (ImportError, OSError) as error:
-        raise MissingDependency(f"CLIP is run by transformers and torch: pip install 'taichi-unifusion[clip]' ({error})") from None
+        raise MissingDependency("CLIP is run by transformers and torch: pip install 'taichi-unifusion[clip]' "
+                                f"({error})") from None
     transformers.logging.set_verbosity_error()
     transformers.logging.disable_progress_bar()
     return torch, transformers

@@ -64,7 +64,8 @@ def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> Tex
         try:
             listed, vectors = [str(name) for name in arrays["names"]], arrays["vectors"]
         except ValueError:
-            raise InputError(f"{path}: its names are Python objects, which can run code; save them as an array of text") from None
+            raise InputError(f"{path}: its names are Python objects, which can run code; save them as an array of "
+                             "text") from None
     else:
         vectors = _load(path)
         beside = [path.with_suffix(suffix) for suffix in (".txt", ".json", ".csv")]

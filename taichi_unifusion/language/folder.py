@@ -46,7 +46,8 @@ class FolderFeatures:
     def _by_number(self, stem: str, index: int) -> Path | None:
         found = NUMBERS.findall(stem)
         wanted = int(found[-1]) if found else index
-        return next((path for other, path in self.files.items() if (n := NUMBERS.findall(other)) and int(n[-1]) == wanted), None)
+        numbered = ((NUMBERS.findall(other), path) for other, path in self.files.items())
+        return next((path for numbers, path in numbered if numbers and int(numbers[-1]) == wanted), None)
 
 
 def folder_features(folder: str | Path, *, layout: Literal["auto", "hwc", "chw"] = "auto") -> FolderFeatures:
@@ -154,7 +155,8 @@ def _open_torch(path: Path):
     try:
         import torch
     except ImportError:
-        raise MissingDependency(f"{path}: .pt files are read by torch: pip install 'taichi-unifusion[clip]', or save .npy") from None
+        raise MissingDependency(f"{path}: .pt files are read by torch: pip install 'taichi-unifusion[clip]', or save "
+                                ".npy") from None
     if not path.exists():
         raise FileNotFoundError
     try:

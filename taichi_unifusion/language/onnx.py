@@ -31,7 +31,7 @@ class OnnxImageEncoder:
         self.session = open_session(file, device)
         inputs = self.session.get_inputs()
         if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].shape[1] != 3 or inputs[0].type not in IMAGE_TYPES:
-            raise InputError(f"{file}: takes {', '.join(f'{i.name} {i.shape} {i.type}' for i in inputs)}, not one image (1, 3, H, W)")
+            raise InputError(f"{file}: takes {_described(inputs)}, not one image (1, 3, H, W)")
         self.input = inputs[0]
         height, width = (side if isinstance(side, int) else None for side in self.input.shape[2:])
         if size and (width not in (size[0], None) or height not in (size[1], None)):
@@ -71,7 +71,8 @@ class OnnxImageEncoder:
             h, w = height // self.patch, width // self.patch
             if raw.shape[1] in (h * w, h * w + 1):
                 return raw[0, -h * w:].reshape(h, w, -1)
-            raise InputError(f"{self.name}: gives {raw.shape[1]} patches for {w}x{h} of {self.patch} pixels; give its patch size")
+            raise InputError(f"{self.name}: gives {raw.shape[1]} patches for {w}x{h} of {self.patch} pixels; give its patch "
+                             "size")
         raise InputError(f"{self.name}: its output is {raw.shape}, not an image of features")
 
 
@@ -83,8 +84,7 @@ class OnnxTextEncoder:
         self.session = open_session(file, device)
         self.inputs = self.session.get_inputs()
         if not 1 <= len(self.inputs) <= 2 or any(len(i.shape) != 2 or i.type not in TOKEN_TYPES for i in self.inputs):
-            raise InputError(f"{file}: takes {', '.join(f'{i.name} {i.shape} {i.type}' for i in self.inputs)}, not token numbers "
-                             "(n, 77) and at most their mask")
+            raise InputError(f"{file}: takes {_described(self.inputs)}, not token numbers (n, 77) and at most their mask")
         length = self.inputs[0].shape[1]
         self.length = length if isinstance(length, int) else TEXT_LENGTH
         self.batch = self.inputs[0].shape[0] if isinstance(self.inputs[0].shape[0], int) else None
@@ -113,7 +113,7 @@ class OnnxTextEncoder:
 def onnx_image_encoder(file: str, *, mean: Sequence[float] = NORMALIZATION["clip"][0],
                        std: Sequence[float] = NORMALIZATION["clip"][1], size: tuple[int, int] | None = None, patch: int = 16,
                        device: str = "auto") -> OnnxImageEncoder:
-    """Image encoder in an ONNX file; `size` (width, height) where the network leaves it open, `patch` where it gives patches."""
+    """Image encoder in an ONNX file; `size` (width, height) where it leaves that open, `patch` where it gives patches."""
     if len(mean) != 3 or len(std) != 3 or min(std) <= 0 or patch < 1:
         raise InputError(f"onnx: needs three means, three positive stds and a positive patch, got {mean}, {std}, {patch}")
     return OnnxImageEncoder(file, mean, std, size, patch, device)
@@ -122,7 +122,8 @@ def onnx_image_encoder(file: str, *, mean: Sequence[float] = NORMALIZATION["clip
 def onnx_text_encoder(file: str, *, tokenizer: str | Path | None = None, device: str = "auto") -> OnnxTextEncoder:
     """Text encoder in an ONNX file; `tokenizer` is CLIP's list of merges."""
     if tokenizer is None:
-        raise InputError(f"onnx:{file}: give CLIP's merges with --tokenizer (bpe_simple_vocab_16e6.txt.gz, or a model's merges.txt)")
+        raise InputError(f"onnx:{file}: give CLIP's merges with --tokenizer (bpe_simple_vocab_16e6.txt.gz, or a model's "
+                         "merges.txt)")
     return OnnxTextEncoder(file, ClipTokenizer(tokenizer), device)
 
 
@@ -138,9 +139,9 @@ def open_session(file: str, device: str) -> Any:
         raise MissingDependency("device: this onnxruntime has no CUDA; pip install onnxruntime-gpu, or say cpu")
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # what goes wrong is said here
+    providers = ["CUDAExecutionProvider"] * (has_cuda and device != "cpu") + ["CPUExecutionProvider"]
     try:  # by path, so that weights in files beside it are found
-        return onnxruntime.InferenceSession(str(file), options,
-                                            providers=["CUDAExecutionProvider"] * (has_cuda and device != "cpu") + ["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(str(file), options, providers=providers)
     except Exception as error:
         raise FileError(f"{file}: not an ONNX model that onnxruntime can run ({_first_line(error)})") from error
 
@@ -151,6 +152,10 @@ def _import_onnxruntime() -> ModuleType:
     except ImportError:
         raise MissingDependency("ONNX models are run by onnxruntime: pip install 'taichi-unifusion[models]'") from None
     return onnxruntime
+
+
+def _described(inputs: Sequence[Any]) -> str:
+    return ", ".join(f"{each.name} {each.shape} {each.type}" for each in inputs)
 
 
 def _first_line(error: Exception) -> str:

@@ -40,8 +40,8 @@ def cameras_that_see(trajectory: Trajectory | None, point: NDArray, count: int =
     T_camera_world = np.linalg.inv(trajectory.T_world_camera)
     seen = T_camera_world[:, :3, :3] @ point + T_camera_world[:, :3, 3]
     distance = np.linalg.norm(seen, axis=1)
-    best = np.argsort(np.arccos(np.clip(seen[:, 2] / np.maximum(distance, 1e-9), -1, 1)) + (distance < NEAR), kind="stable")[:count]
-    best = np.sort(best)
+    angle = np.arccos(np.clip(seen[:, 2] / np.maximum(distance, 1e-9), -1, 1))
+    best = np.sort(np.argsort(angle + (distance < NEAR), kind="stable")[:count])
     return Trajectory(trajectory.timestamps[best], trajectory.T_world_camera[best])
 
 

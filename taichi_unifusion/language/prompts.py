@@ -14,7 +14,8 @@ from .embeddings import TextEmbeddings
 TEMPLATES = ("{}", "a {}", "a photo of a {}", "a photo of a {} in a room", "there is a {} in the scene")
 # What a query must beat: words for anything, and what rooms are full of. Those too near to the query drop out.
 NEGATIVES = ("object", "thing", "stuff", "texture", "other", "wall", "floor", "ceiling", "door", "window", "table", "chair",
-             "cabinet", "bed", "sofa", "lamp", "painting", "box", "bag", "book", "shelf", "curtain", "carpet", "plant", "person")
+             "cabinet", "bed", "sofa", "lamp", "painting", "box", "bag", "book", "shelf", "curtain", "carpet", "plant",
+             "person")
 SYNONYM = 0.9       # cosine of two texts above which one does not compete with the other
 LOGIT_SCALE = 100.0  # CLIP's own, learned: cosines become logits
 

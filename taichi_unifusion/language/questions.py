@@ -48,14 +48,15 @@ def ask(features: LatentMap, mesh: Mesh, encoder: TextEncoder, texts: Sequence[s
     parts = [_scores(features, mesh.vertices[first:first + POINTS_AT_ONCE], both, distances)
              for first in range(0, max(len(mesh.vertices), 1), POINTS_AT_ONCE)]
     similarity, scores = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return [Answer(text, scores[:, i], similarity[:, i],
-                   tuple(find_regions(mesh, scores[:, i], threshold=threshold, min_area=min_area))) for i, text in enumerate(texts)]
+    regions = [find_regions(mesh, column, threshold=threshold, min_area=min_area) for column in scores.T]
+    return [Answer(text, scores[:, i], similarity[:, i], tuple(regions[i])) for i, text in enumerate(texts)]
 
 
 def _scores(features: LatentMap, points: NDArray, both: NDArray, distances: NDArray) -> tuple[NDArray, NDArray]:
     """Similarity and relevance (N, n) of n queries, which come before their m rivals in `both`, at `distances` (n, m).
 
-    A rival that is as near as noise makes it, by SURE standard deviations, counts as nearer: seldom seen surface answers seldom.
+    A rival that is as near as noise makes it, by SURE standard deviations, counts as nearer: surface
+    that was seldom seen answers seldom.
     """
     similarity, known = features.similarity(points, both, return_valid=True)
     margin = SURE * features.uncertainty(points)[:, None]

@@ -14,6 +14,7 @@ from ..encoding import position_encoding
 from ..errors import CapacityError, FrameError, InputError, MapCorrupt
 from ..kernels import fusion, regression
 from ..kernels import latent as kernels
+from ..kernels import latent_query as decoding
 from ..kernels.voxels import CELLS
 from ..types import FeatureImage, PointCloud
 from .base_map import BaseMap, Integration
@@ -180,12 +181,12 @@ class LatentMap(BaseMap):
         scores, valid = [], None
         for first in range(0, len(texts), TEXTS_AT_ONCE):
             part = texts[first:first + TEXTS_AT_ONCE]
-            filled = np.zeros((-(-len(part) // kernels.DIRECTIONS) * kernels.DIRECTIONS, self.channels), np.float32)
+            filled = np.zeros((-(-len(part) // decoding.DIRECTIONS) * decoding.DIRECTIONS, self.channels), np.float32)
             filled[:len(part)] = part
-            products = self._solved(lambda out: kernels.project_rows(len(self), self._rows, filled, out), len(filled))
+            products = self._solved(lambda out: decoding.project_rows(len(self), self._rows, filled, out), len(filled))
             lengths = np.ones(len(self), np.float32)
             if len(self):
-                kernels.mean_lengths(len(self), self._rows, lengths)
+                decoding.mean_lengths(len(self), self._rows, lengths)
             values, valid = self._decode(points, products / np.maximum(lengths, 1e-12)[:, None, None])
             scores.append(values[:, :len(part)])
         values = np.concatenate(scores, axis=1)
@@ -201,7 +202,7 @@ class LatentMap(BaseMap):
         n = len(self)
         lengths, weights = np.ones(n, np.float32), np.ones(n, np.float32)
         if n:
-            kernels.mean_lengths(n, self._rows, lengths)
+            decoding.mean_lengths(n, self._rows, lengths)
             weights = self._grid.weights.to_numpy()[:n]
         more = np.maximum(weights, 1 + 1e-3)
         agreeing = np.clip((lengths**2 - 1 / more) / (1 - 1 / more), 1e-3, 1)
@@ -214,7 +215,7 @@ class LatentMap(BaseMap):
         values, valid = np.zeros((len(points), self.channels), np.float32), np.zeros(len(points), bool)
         for first in range(0, self.channels, CHANNELS_AT_ONCE):
             count = min(CHANNELS_AT_ONCE, self.channels - first)
-            products = self._solved(lambda out: kernels.take_channels(len(self), self._rows, first, out), count)
+            products = self._solved(lambda out: decoding.take_channels(len(self), self._rows, first, out), count)
             values[:, first:first + count], valid = self._decode(points, products)
         return (values, valid) if return_valid else values
 
@@ -224,7 +225,7 @@ class LatentMap(BaseMap):
         products = np.zeros((max(len(self), 1), 1 + self._rank, count), np.float32)
         if len(self):
             fill(products)
-            kernels.solve_rows(self._rank, len(self), self._grid.latents, self._grid.weights, self.settings.noise, products)
+            decoding.solve_rows(self._rank, len(self), self._grid.latents, self._grid.weights, self.settings.noise, products)
         return products
 
     def _decode(self, points: NDArray, products: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -233,7 +234,7 @@ class LatentMap(BaseMap):
             raise InputError(f"query: points must be (N, 3), got {points.shape}")
         values, valid = np.zeros((len(points), products.shape[2]), np.float32), np.zeros(len(points), np.uint8)
         if len(points) and len(self):
-            kernels.query_products(self._rank, points, 1.0 / self.voxel_size, self._grid.slot, products, self._table, NODES,
+            decoding.query_products(self._rank, points, 1.0 / self.voxel_size, self._grid.slot, products, self._table, NODES,
                                    NEAREST_REACH, values, valid)
         return values, valid.astype(bool)
 

@@ -1,0 +1,177 @@
+"""Features of a map when they are asked for: texts times rows, the regression of each voxel, its value at points (Sec. IV-D).
+
+See `latent.py` for what a voxel keeps.
+"""
+
+import taichi as ti
+
+from .latent import Bytes1, Halves3
+from .query import nearest_voxel
+from .voxels import INDEX_HALF, Floats1, Floats2, Floats3, all_within, row3, voxel_of
+
+DIRECTIONS = 4   # texts that a row is multiplied with at once
+
+
+@ti.kernel
+def project_rows(
+    # in:
+    voxels: ti.i32,
+    rows: Halves3,        # (S, r, c)
+    directions: Floats2,  # (T, c), T a multiple of DIRECTIONS
+    # out:
+    products: Floats3,    # (S, r, T)
+):
+    for s in range(voxels):
+        for a in range(rows.shape[1]):
+            for part in range(directions.shape[0] // DIRECTIONS):
+                sums = ti.Vector([0.0] * DIRECTIONS)
+                for c in range(rows.shape[2]):
+                    y = ti.cast(rows[s, a, c], ti.f32)
+                    for t in ti.static(range(DIRECTIONS)):
+                        sums[t] += y * directions[part * DIRECTIONS + t, c]
+                for t in ti.static(range(DIRECTIONS)):
+                    products[s, a, part * DIRECTIONS + t] = sums[t]
+
+
+@ti.kernel
+def take_channels(
+    # in:
+    voxels: ti.i32,
+    rows: Halves3,      # (S, r, c)
+    first: ti.i32,
+    # out:
+    products: Floats3,  # (S, r, T) channels first .. first + T
+):
+    for s, a in ti.ndrange(voxels, rows.shape[1]):
+        for t in range(products.shape[2]):
+            products[s, a, t] = ti.cast(rows[s, a, first + t], ti.f32)
+
+
+@ti.kernel
+def mean_lengths(
+    # in:
+    voxels: ti.i32,
+    rows: Halves3,     # (S, r, c)
+    # out:
+    lengths: Floats1,  # (S,) |E[y]|
+):
+    for s in range(voxels):
+        total = 0.0
+        for c in range(rows.shape[2]):
+            y = ti.cast(rows[s, 0, c], ti.f32)
+            total += y * y
+        lengths[s] = ti.sqrt(total)
+
+
+@ti.kernel
+def solve_rows(
+    # in:
+    rank: ti.template(),
+    voxels: ti.i32,
+    moments: Floats3,   # (S, q + q (q + 1) / 2, 1)
+    weights: Floats1,   # (S,)
+    noise: ti.f32,      # d of Eq. 6 for one feature pixel
+    # in and out:
+    products: Floats3,  # (S, 1 + q, T) products of the rows -> the constant and the coefficients of f_posi
+):
+    for s in range(voxels):
+        L = ti.Vector([0.0] * (rank * rank))
+        at = rank
+        for a in range(rank):  # Cholesky factor, row by row; the diagonal keeps its inverse
+            for b in range(a + 1):
+                value = moments[s, at, 0] - moments[s, a, 0] * moments[s, b, 0]
+                at += 1
+                for k in range(b):
+                    value -= L[a * rank + k] * L[b * rank + k]
+                if a == b:
+                    L[a * rank + a] = 1.0 / ti.sqrt(ti.max(value + noise / weights[s], 1e-12))
+                else:
+                    L[a * rank + b] = value * L[b * rank + b]
+        for t in range(products.shape[2]):
+            F = ti.Vector([0.0] * rank)
+            mean = products[s, 0, t]
+            for a in range(rank):
+                value = products[s, 1 + a, t] - moments[s, a, 0] * mean
+                for k in range(a):
+                    value -= L[a * rank + k] * F[k]
+                F[a] = value * L[a * rank + a]
+            for back in range(rank):
+                a = rank - 1 - back
+                value = F[a]
+                for k in range(a + 1, rank):
+                    value -= L[k * rank + a] * F[k]
+                F[a] = value * L[a * rank + a]
+                mean -= moments[s, a, 0] * F[a]
+                products[s, 1 + a, t] = F[a]
+            products[s, 0, t] = mean
+
+
+@ti.func
+def table_features(t: ti.template(), rank: ti.template(), table: ti.template(), nodes: ti.i32):
+    """Position features at t by trilinear interpolation in a table of nodes^3 rows that spans [-0.5, 0.5]^3."""
+    x = (t + 0.5) * (nodes - 1)
+    corner = ti.math.clamp(ti.floor(x, ti.i32), 0, nodes - 2)
+    r = x - corner
+    f = ti.Vector([0.0] * rank)
+    for o in ti.static(range(8)):
+        step = ti.Vector([o // 4, o // 2 % 2, o % 2])
+        at = corner + step
+        share = 1.0
+        for d in ti.static(range(3)):
+            share *= r[d] if ti.static((o, o // 2, o // 4)[2 - d] % 2 == 1) else 1.0 - r[d]
+        row = (at[0] * nodes + at[1]) * nodes + at[2]
+        for a in ti.static(range(rank)):
+            f[a] += share * table[row, a]
+    return f
+
+
+@ti.kernel
+def query_products(
+    # in:
+    rank: ti.template(),
+    points: Floats2,     # (N, 3) world [m]
+    per_meter: ti.f32,
+    slot: ti.template(),
+    products: Floats3,   # (S, 1 + q, T) constants and coefficients
+    table: Floats2,      # (nodes^3, q)
+    nodes: ti.i32,
+    reach: ti.i32,       # points that no voxel covers take the value of the nearest one within so many voxels
+    # out:
+    values: Floats2,     # (N, T)
+    valid: Bytes1,       # (N,) = 1 where a voxel covers the point
+):
+    for n in range(points.shape[0]):
+        x = row3(points, n) * per_meter
+        weight, covered, found = 0.0, 0, 0
+        slots = ti.Vector([0] * 9)
+        shares = ti.Vector([0.0] * (9 * (1 + rank)))  # of each voxel's constant and coefficients in the value
+        if all_within(x, INDEX_HALF - 1.0):
+            corner = voxel_of(x - 0.5)
+            for o in range(9):
+                ijk, s = corner, -1
+                if o < 8:
+                    ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
+                    s = slot[ijk + INDEX_HALF] - 1
+                elif weight == 0 and reach > 0:
+                    s, ijk = nearest_voxel(x, reach, slot)
+                if s >= 0:
+                    at = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
+                    tent = 1.0
+                    for d in ti.static(range(3)):
+                        tent *= ti.max(1.0 - 2.0 * ti.abs(at[d]), 0.0)
+                    tent = ti.max(tent, 1e-6)  # on the border of the only voxel there is, its value still counts
+                    f = table_features(at, rank, table, nodes)
+                    shares[found * (1 + rank)] = tent
+                    for a in ti.static(range(rank)):
+                        shares[found * (1 + rank) + 1 + a] = tent * f[a]
+                    slots[found] = s
+                    found += 1
+                    weight += tent
+                    covered += ti.cast(o < 8, ti.i32)
+        valid[n] = ti.cast(covered > 0, ti.u8)
+        for t in range(values.shape[1]):
+            value = 0.0
+            for i in range(found):
+                for a in ti.static(range(1 + rank)):
+                    value += shares[i * (1 + rank) + a] * products[slots[i], a, t]
+            values[n, t] = value / ti.max(weight, 1e-12)
