@@ -1,0 +1,90 @@
+"""ORB features with depth: recognises a place seen before and says roughly where the camera is in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import Frame
+
+FEATURES = 800
+RATIO = 0.8            # best against second-best distance of a match
+REPROJECTION = 6.0     # [px] of a match that supports a pose
+MIN_MATCHES = 12       # that support a pose
+RANSAC_ITERATIONS = 300
+QUERY_FEATURES = 200   # of the strongest, that vote for similar keyframes
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Corners of a frame that have a depth, strongest first."""
+
+    descriptors: NDArray[np.uint8]  # (N, 32)
+    pixels: NDArray[np.float32]     # (N, 2) u, v
+    points: NDArray[np.float32]     # (N, 3) camera [m]
+    K: NDArray[np.float64]          # (3, 3)
+
+    def __len__(self) -> int:
+        return len(self.descriptors)
+
+
+def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Features:
+    """ORB features of a frame at pixels with a reading in range; none where it has no colour."""
+    camera = frame.camera
+    empty = Features(np.empty((0, 32), np.uint8), np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), camera.matrix)
+    if frame.color is None:
+        return empty
+    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+    corners, descriptors = cv2.ORB_create(FEATURES, fastThreshold=10).detectAndCompute(gray, None)
+    if not corners:
+        return empty
+    pixels = np.array([corner.pt for corner in corners], np.float32)
+    at = np.rint(pixels).astype(int).clip(0, (camera.width - 1, camera.height - 1))
+    z = frame.depth[at[:, 1], at[:, 0]]
+    with np.errstate(invalid="ignore"):
+        seen = np.isfinite(z) & (z >= depth_min) & (z <= depth_max)
+    order = np.argsort([-corner.response for corner in corners], kind="stable")
+    order = order[seen[order]]
+    rays = (pixels[order] - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    points = np.column_stack([rays, np.ones(len(order))]) * z[order, None]
+    return Features(descriptors[order], pixels[order], points.astype(np.float32), camera.matrix)
+
+
+def most_similar(query: Features, others: Sequence[Features], count: int) -> list[int]:
+    """Numbers of the `count` of `others` that most of the query's strongest features find their nearest neighbour in."""
+    sizes = [len(other) for other in others]
+    if not len(query) or not sum(sizes):
+        return []
+    stacked = np.vstack([other.descriptors for other in others])
+    owner = np.repeat(np.arange(len(others)), sizes)
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING).match(query.descriptors[:QUERY_FEATURES], stacked)
+    votes = np.bincount(owner[[match.trainIdx for match in matches]], minlength=len(others))
+    best = np.argsort(-votes, kind="stable")[:count]
+    return [int(k) for k in best if votes[k] > 0]
+
+
+def locate(query: Features, other: Features) -> NDArray[np.float64] | None:
+    """T_other_query from matched features by perspective-n-point RANSAC, or None where too few of them agree."""
+    if min(len(query), len(other)) < MIN_MATCHES:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(query.descriptors, other.descriptors, k=2)
+    good = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
+    if len(good) < MIN_MATCHES:
+        return None
+    points = np.array([other.points[match.trainIdx] for match in good], np.float64)
+    pixels = np.array([query.pixels[match.queryIdx] for match in good], np.float64)
+    cv2.setRNGSeed(0)  # the same frames give the same pose
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        points, pixels, query.K, None, iterationsCount=RANSAC_ITERATIONS, reprojectionError=REPROJECTION, flags=cv2.SOLVEPNP_AP3P)
+    if not found or inliers is None or len(inliers) < MIN_MATCHES:
+        return None
+    T_query_other = np.eye(4)
+    T_query_other[:3, :3], T_query_other[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
+    R = T_query_other[:3, :3]
+    T_other_query = np.eye(4)
+    T_other_query[:3, :3], T_other_query[:3, 3] = R.T, -R.T @ T_query_other[:3, 3]
+    return T_other_query if np.isfinite(T_other_query).all() else None

@@ -1,0 +1,96 @@
+"""Frame -> surfel images, coarse to fine: what registration works on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import runtime
+from ..types import Frame, PinholeCamera
+
+FINEST_WIDTH = 320         # [px] at least; finer images add time and noise, no accuracy
+SMALLEST = 24              # [px] shorter side of the coarsest level
+NORMAL_RADIUS = (3, 2, 2)  # [px] by level, finest first
+EDGE_JUMP = 0.03           # of the depth between pixels of one surface, doubled from level to level
+EDGE_SUPPORT = 5           # as in preprocessing
+MAX_ANGLE = 80.0           # [degrees] between ray and normal
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedFrame:
+    """What of a frame is enough to build its pyramid again: the finest level's images."""
+
+    inverse: NDArray[np.float32]    # (h, w) [1/m], 0: none
+    intensity: NDArray[np.float16]  # (h, w) in [0, 1]; zero where the frame has no colour
+    camera: PinholeCamera           # of these pixels
+
+
+@dataclass(frozen=True, eq=False)
+class SurfelImage:
+    """One level: an (h, w, 8) image of surfels on the device (kernels/registration.py), and the camera of its pixels."""
+
+    surfels: Any
+    camera: PinholeCamera
+
+
+@dataclass(frozen=True, eq=False)
+class SurfelPyramid:
+    """A frame as surfel images, finest first, each half the size of the one before."""
+
+    levels: tuple[SurfelImage, ...]
+
+
+def reduce_frame(frame: Frame, depth_min: float, depth_max: float) -> ReducedFrame:
+    """Inverse depth without flying pixels and intensity, averaged over blocks of pixels."""
+    runtime.current()
+    from ..kernels import images
+    from ..kernels import registration as kernels
+
+    depth = np.ascontiguousarray(frame.depth)
+    clipped, inverse = np.empty_like(depth), np.empty_like(depth)
+    images.clip_depth(depth, depth_min, depth_max, clipped)
+    images.drop_flying_pixels(clipped, EDGE_JUMP, EDGE_SUPPORT, inverse)
+    factor = max(1, frame.camera.width // FINEST_WIDTH)
+    camera = shrunk(frame.camera, factor)
+    reduced, intensity = (np.zeros((camera.height, camera.width), np.float32) for _ in range(2))
+    kernels.average_inverse_depth(inverse, factor, EDGE_JUMP, reduced)
+    if frame.color is not None:
+        kernels.average_color(np.ascontiguousarray(frame.color), factor, intensity)
+    return ReducedFrame(reduced, intensity.astype(np.float16), camera)
+
+
+def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
+    """Surfel images of a frame: depth, normals, intensity and its slopes at every level."""
+    import taichi as ti
+
+    from ..kernels import images
+    from ..kernels import registration as kernels
+
+    inverse, intensity, camera = reduced.inverse, reduced.intensity.astype(np.float32), reduced.camera
+    cosine = float(np.cos(np.radians(MAX_ANGLE)))
+    levels = []
+    for level, radius in enumerate(NORMAL_RADIUS):
+        jump = EDGE_JUMP * 2**level
+        if level:
+            if min(camera.size) < 2 * SMALLEST:
+                break
+            camera = shrunk(camera, 2)
+            finer, finer_intensity = inverse, intensity
+            inverse, intensity = (np.empty((camera.height, camera.width), np.float32) for _ in range(2))
+            kernels.average_inverse_depth(finer, 2, jump, inverse)
+            kernels.average_intensity(finer_intensity, intensity)
+        normals = np.empty((*inverse.shape, 3), np.float32)
+        images.estimate_normals(inverse, camera.fx, camera.fy, camera.cx, camera.cy, radius, jump, cosine, normals)
+        surfels = ti.ndarray(ti.f32, (*inverse.shape, kernels.CHANNELS))
+        kernels.pack_surfels(inverse, normals, intensity, surfels)
+        levels.append(SurfelImage(surfels, camera))
+    return SurfelPyramid(tuple(levels))
+
+
+def shrunk(camera: PinholeCamera, factor: int) -> PinholeCamera:
+    """The camera of an image whose pixels are blocks of factor x factor; a remainder at the right and below is left out."""
+    return PinholeCamera(camera.width // factor, camera.height // factor, camera.fx / factor, camera.fy / factor,
+                         (camera.cx + 0.5) / factor - 0.5, (camera.cy + 0.5) / factor - 0.5)

@@ -1,0 +1,119 @@
+"""The built-in RGB-D tracker: poses from frames alone.
+
+Every frame is aligned to the last keyframe, from where its motion so far would take it; keyframes are aligned to all that see
+the same, loops included, and a pose graph spreads what does not fit. A frame that fits nowhere gets no pose; the next ones are
+looked for by their features.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..preprocessing import PreprocessSettings
+from ..types import Frame
+from . import se3
+from .base import TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
+from .features import locate, most_similar
+from .loop_closure import believable
+from .odometry import KeyframeOdometry, View
+from .registration import Registration, register
+
+CANDIDATES = 3  # keyframes that a lost frame is compared with
+# The world of a recording without poses: origin at the first camera, z up if that camera is level.
+T_WORLD_FIRST = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+class RgbdTracker(Tracker):
+    """Frame-to-keyframe alignment, loop closing, relocalisation; needs no poses."""
+
+    uses_given_poses = False
+
+    def __init__(self, settings: TrackingSettings | None = None, preprocess: PreprocessSettings | None = None,
+                 T_world_first: NDArray = T_WORLD_FIRST) -> None:
+        self.settings = settings or TrackingSettings()
+        self.odometry = KeyframeOdometry(self.settings, preprocess or PreprocessSettings())
+        self.T_world_first = np.array(T_world_first, np.float64)
+        self.motion = np.eye(4)                    # from the frame before last to the last one, in camera coordinates
+        self.T_world_camera: NDArray | None = None  # of the last frame that was tracked
+        self.lost = False
+
+    def track(self, frame: Frame) -> TrackedFrame:
+        odometry = self.odometry
+        view = odometry.view(frame)
+        if view.blank:
+            return self._give_up(frame, view.blank)
+        if not len(odometry.keyframes):
+            return self._start(view)
+        found, problem = self._align(view)
+        if found is not None:
+            return self._accept(view, found, Verdict.TRACKED)
+        if (place := self._relocalise(view)) is not None:
+            odometry.reference, found = place
+            return self._accept(view, found, Verdict.RELOCALISED)
+        if len(odometry.placements) == 1 and not odometry.edges:  # nothing ever fitted the first frame: begin with this one
+            odometry.placements.clear()
+            first = odometry.keyframes.items[0].index
+            self.odometry = KeyframeOdometry(self.settings, PreprocessSettings(depth_min=odometry.depth_range[0]))
+            self.odometry.give_up(first, None, Verdict.LOST, "the next frame does not fit it")
+            return self._start(view)
+        return self._give_up(frame, problem)
+
+    def skip(self, index: int, error: Exception) -> TrackedFrame:
+        tracked = super().skip(index, error)
+        return self.odometry.give_up(index, None, tracked.verdict, tracked.message)
+
+    def finish(self) -> TrackingResult:
+        return self.odometry.result()
+
+    def _start(self, view: View) -> TrackedFrame:
+        self.odometry.add_keyframe(view, self.T_world_first, None)
+        self.T_world_camera = self.T_world_first
+        return self.odometry.place(view, Verdict.TRACKED, np.eye(4))
+
+    def _align(self, view: View) -> tuple[Registration | None, str]:
+        """Alignment to the reference keyframe from where the camera may be, the likeliest guess first."""
+        reference, problem = self.odometry.keyframes.items[self.odometry.reference], ""
+        guesses = [lambda: self.T_world_camera @ self.motion, lambda: self.T_world_camera, lambda: self._by_features(view)]
+        for guess in guesses[1 if self.lost else 0:]:
+            if (T_world_camera := guess()) is None:
+                continue
+            found, wrong = self.odometry.align(view, T_world_camera, self.settings.window)
+            if not wrong:
+                return found, ""
+            problem = problem or wrong
+        return None, problem
+
+    def _by_features(self, view: View) -> NDArray | None:
+        reference = self.odometry.reference
+        guess = locate(view.features(), self.odometry.keyframes.items[reference].features)
+        return None if guess is None else self.odometry.keyframes.T_world_keyframe[reference] @ guess
+
+    def _relocalise(self, view: View) -> tuple[int, Registration] | None:
+        """The keyframe that a lost view belongs to, and its alignment to it."""
+        keyframes = self.odometry.keyframes
+        for number in most_similar(view.features(), [keyframe.features for keyframe in keyframes.items], CANDIDATES):
+            guess = locate(view.features(), keyframes.items[number].features)
+            if guess is None:
+                continue
+            found = register(view.pyramid, keyframes.pyramid(number), guess, self.settings.photometric_weight)
+            if believable(found, guess):
+                return number, found
+        return None
+
+    def _accept(self, view: View, found: Registration, verdict: Verdict) -> TrackedFrame:
+        odometry = self.odometry
+        T_world_camera = se3.normalized(odometry.keyframes.T_world_keyframe[odometry.reference] @ found.T_target_source)
+        self.motion = np.eye(4) if self.lost else se3.inverse(self.T_world_camera) @ T_world_camera
+        self.lost = False
+        tracked = odometry.place(view, verdict, found.T_target_source, found)
+        if odometry.is_far(found):
+            number = odometry.add_keyframe(view, T_world_camera, found)
+            odometry.link_keyframe(number, by_appearance=True)
+            T_world_camera = odometry.keyframes.T_world_keyframe[number]
+        self.T_world_camera = T_world_camera
+        return tracked
+
+    def _give_up(self, frame: Frame, problem: str) -> TrackedFrame:
+        self.lost, self.motion = True, np.eye(4)
+        return self.odometry.give_up(frame.index, frame.timestamp, Verdict.LOST, problem)
