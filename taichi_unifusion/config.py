@@ -21,6 +21,7 @@ from .errors import ConfigError, InputError
 from .io import read_bytes
 from .maps.settings import LatentSettings, PropertySettings, SurfaceSettings
 from .preprocessing import PreprocessSettings
+from .tracking.base import TrackingSettings
 
 MAX_RESOLUTION = 32  # cells a voxel that `SurfaceMap.extract_mesh` takes
 
@@ -51,6 +52,8 @@ class Config:
     """CPU threads to use; 0: all."""
     preprocess: PreprocessSettings = field(default_factory=PreprocessSettings)
     """Which pixels become points."""
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    """How poses are found and refined, with --tracking internal or rgbd."""
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     """The map of the surface."""
     color: PropertySettings = field(default_factory=PropertySettings)

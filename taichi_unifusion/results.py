@@ -8,7 +8,7 @@ import platform
 import resource
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +30,7 @@ from .types import Mesh, Trajectory
 
 logger = logging.getLogger(__name__)
 
+TRACKING_FILE = "tracking.csv"
 MESH_FILES = ("mesh.ply", "mesh.glb", "mesh.obj")
 
 
@@ -86,9 +87,15 @@ def remove_temporaries(directory: Path) -> None:
             path.unlink()
 
 
-def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, about: Mapping[str, Any] | None = None) -> Results:
-    """Write everything that a run gave, the maps first; `about` joins the metrics (which recording, which frames)."""
-    folder, started = ResultsFolder(prepare_results(directory)), time.perf_counter()
+def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, about: Mapping[str, Any] | None = None,
+                  written: Sequence[str] = ()) -> Results:
+    """Write everything that a run gave, the maps first; `about` joins the metrics (which recording, which frames).
+
+    `written` names files in the folder that belong to this run and are there already.
+    """
+    folder, started = ResultsFolder(prepare_results(directory), list(written)), time.perf_counter()
+    if TRACKING_FILE not in written:
+        folder.remove(TRACKING_FILE)
     logger.info("writing to %s", folder.directory)
     for name, saved in pipeline.maps.items():
         folder.write(f"maps/{name}.safetensors", saved.save)

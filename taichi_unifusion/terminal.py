@@ -122,6 +122,15 @@ def format_bytes(count: float) -> str:
     return f"{count:.2f} GB"
 
 
+def _tracking_lines(tracking: Mapping[str, Any] | None) -> list[str]:
+    """How the poses were found, where they were."""
+    if not tracking:
+        return []
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in tracking["verdicts"].items())
+    found = [f"{tracking[name]} {name}" for name in ("keyframes", "loops") if name in tracking]
+    return [f"tracking {tracking['mode']}: {counts}{'; ' if found else ''}{', '.join(found)} ({tracking['seconds']:.1f} s)"]
+
+
 def summarize(metrics: Mapping[str, Any], files: Sequence[str], directory: Path) -> str:
     """The end of a run in some lines: its metrics, and the files that it wrote."""
     frames, seconds, mesh = metrics["frames"], metrics["seconds"], metrics["mesh"]
@@ -130,7 +139,8 @@ def summarize(metrics: Mapping[str, Any], files: Sequence[str], directory: Path)
     maps = [["map", "voxels", "voxel size", "memory"]]
     maps += [[name, f"{value['voxels']:,}", f"{100 * value['voxel_size']:g} cm", format_bytes(value["bytes"])]
              for name, value in metrics["maps"].items()]
-    lines = [f"frames   {frames['used']} used, {frames['skipped']} skipped{', stopped early' if frames['interrupted'] else ''}"]
+    lines = _tracking_lines(metrics.get("tracking"))
+    lines += [f"frames   {frames['used']} used, {frames['skipped']} skipped{', stopped early' if frames['interrupted'] else ''}"]
     lines += [f"           {entry['frames']} {entry['reason']} (first: {entry['first']})" for entry in frames["reasons"]]
     lines += ["", format_table(stages), "", format_table(maps), ""]
     if mesh:

@@ -16,6 +16,7 @@ from ..datasets import Dataset
 from ..interrupts import INTERRUPTED, stop_on_signal
 from ..terminal import frame_progress, report, summarize
 from .recording import RecordingOptions
+from .tracking import TrackingOptions
 
 if TYPE_CHECKING:
     from ..language import ImageEncoder
@@ -24,10 +25,12 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class ReconstructOptions(RecordingOptions):
-    """Turn a recording of RGB-D frames with camera poses into a coloured mesh.
+class ReconstructOptions(TrackingOptions, RecordingOptions):
+    """Turn a recording of RGB-D frames into a coloured mesh.
 
     Example: unifusion reconstruct 7scenes my/redkitchen --every 10 --out results/kitchen
+
+    Without camera poses: unifusion reconstruct folder my_recording --tracking rgbd --out results/mine
 
     Settings that `unifusion config --help` explains are options here too,
 
@@ -62,8 +65,12 @@ def reconstruct(options: Reconstruct, encoder: ImageEncoder | None = None) -> in
 def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop: Callable[[], bool],
                    encoder: ImageEncoder | None) -> int:
     from ..pipeline import Pipeline
-    from ..results import write_results
+    from ..results import TRACKING_FILE, write_results
 
+    about, written = {"recording": {**options.about, "frames": len(frames)}}, []
+    if options.tracking != "given":
+        frames, about["tracking"] = options.track(options, options.settings, directory, stop)
+        written = [TRACKING_FILE]
     pipeline = Pipeline(options.settings, encoder=encoder)
     with frame_progress(len(frames)) as on_frame:
         run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
@@ -74,7 +81,7 @@ def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop:
     if done < len(frames):
         logger.warning("%s after %d of %d frames; writing what they gave", "stopped" if run.interrupted else "ended early",
                        done, len(frames))
-    results = write_results(directory, pipeline, run, {"recording": {**options.about, "frames": len(frames)}})
+    results = write_results(directory, pipeline, run, about, written)
     print(json.dumps(results.metrics, indent=2) if options.json else summarize(results.metrics, results.files, directory))
     code = report([error for error in (run.failure, *results.failures) if error])
     return INTERRUPTED if stop() else code

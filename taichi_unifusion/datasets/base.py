@@ -27,6 +27,10 @@ class Dataset(ABC, Sequence[Frame]):
     def load(self, index: int) -> Frame:
         """Load frame `index` of 0..len-1."""
 
+    def without_poses(self) -> Dataset:
+        """The same frames where their poses do not matter: broken or missing ones cost nothing."""
+        return self
+
     @overload
     def __getitem__(self, index: int) -> Frame: ...
     @overload
@@ -55,3 +59,6 @@ class DatasetView(Dataset):
 
     def load(self, index: int) -> Frame:
         return self.dataset.load(self.indices[index])
+
+    def without_poses(self) -> DatasetView:
+        return DatasetView(self.dataset.without_poses(), self.indices)

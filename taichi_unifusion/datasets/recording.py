@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
 
@@ -46,10 +47,18 @@ class Recording(Dataset):
         self.depth_scale = check_depth_scale(depth_scale, name)
         self.invalid, self.fit_color, self.drop_alpha = tuple(invalid), fit_color, drop_alpha
         poses = [frame.pose for frame in self.frames if frame.pose is not None]
-        self.warnings = (*warnings, *camera_warnings(camera), *pose_warnings(poses))
+        self.pose_warnings = tuple(pose_warnings(poses))
+        self.warnings = (*warnings, *camera_warnings(camera), *self.pose_warnings)
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def without_poses(self) -> Recording:
+        """The same frames, their poses left out; so are the warnings about those."""
+        bare = copy(self)
+        bare.frames = tuple(replace(frame, pose=None) for frame in self.frames)
+        bare.warnings = tuple(warning for warning in self.warnings if warning not in self.pose_warnings)
+        return bare
 
     def load(self, index: int) -> Frame:
         """Read frame `index`; FrameError (PoseError, SizeMismatch) names the file that is at fault."""

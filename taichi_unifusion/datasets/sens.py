@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -68,6 +69,8 @@ class SensRecord:
 class SensFile(Dataset):
     """The frames of a .sens file, each read when asked for."""
 
+    has_poses = True
+
     def __init__(self, path: Path, *, depth_scale: float | None = None, camera: PinholeCamera | None = None,
                  drop_alpha: bool = False) -> None:
         self.name, self.path, self.drop_alpha = f"scannet {path}", path, drop_alpha
@@ -87,10 +90,16 @@ class SensFile(Dataset):
     def __len__(self) -> int:
         return len(self.records)
 
+    def without_poses(self) -> SensFile:
+        """The same frames, their poses left out."""
+        bare = copy(self)
+        bare.has_poses = False
+        return bare
+
     def load(self, index: int) -> Frame:
         """Read frame `index`; FrameError names the file and the frame."""
         record, where = self.records[index], f"{self.path} frame {index}"
-        T_world_camera = record.pose.checked()
+        T_world_camera = record.pose.checked() if self.has_poses else None
         try:
             with open(self.path, "rb") as file:
                 file.seek(record.offset)

@@ -101,11 +101,11 @@ class TrackingSettings:
     """Weight of colour against geometry when frames are aligned; colour decides what geometry leaves open. 0: geometry alone."""
     depth_max: float = 6.0
     """Farthest reading that tracking uses, in metres."""
-    keyframe_distance: float = 0.15
+    keyframe_distance: float = 0.10
     """A new keyframe is made when the camera is this far from the last one, in metres ..."""
-    keyframe_angle: float = 10.0
+    keyframe_angle: float = 7.0
     """... or has turned by this angle, in degrees ..."""
-    keyframe_fitness: float = 0.7
+    keyframe_fitness: float = 0.8
     """... or less than this share of the frame lies on it."""
     window: int = 1
     """How many recent keyframes a frame is aligned to; internal tracking uses at least 3."""

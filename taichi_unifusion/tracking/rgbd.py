@@ -7,6 +7,8 @@ looked for by their features.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +18,7 @@ from . import se3
 from .base import TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
 from .features import locate, most_similar
 from .loop_closure import believable
-from .odometry import KeyframeOdometry, View
+from .odometry import KeyframeOdometry, Placement, View
 from .registration import Registration, register
 
 CANDIDATES = 3  # keyframes that a lost frame is compared with
@@ -31,8 +33,8 @@ class RgbdTracker(Tracker):
 
     def __init__(self, settings: TrackingSettings | None = None, preprocess: PreprocessSettings | None = None,
                  T_world_first: NDArray = T_WORLD_FIRST) -> None:
-        self.settings = settings or TrackingSettings()
-        self.odometry = KeyframeOdometry(self.settings, preprocess or PreprocessSettings())
+        self.settings, self.preprocess = settings or TrackingSettings(), preprocess or PreprocessSettings()
+        self.odometry = KeyframeOdometry(self.settings, self.preprocess)
         self.T_world_first = np.array(T_world_first, np.float64)
         self.motion = np.eye(4)                    # from the frame before last to the last one, in camera coordinates
         self.T_world_camera: NDArray | None = None  # of the last frame that was tracked
@@ -51,12 +53,8 @@ class RgbdTracker(Tracker):
         if (place := self._relocalise(view)) is not None:
             odometry.reference, found = place
             return self._accept(view, found, Verdict.RELOCALISED)
-        if len(odometry.placements) == 1 and not odometry.edges:  # nothing ever fitted the first frame: begin with this one
-            odometry.placements.clear()
-            first = odometry.keyframes.items[0].index
-            self.odometry = KeyframeOdometry(self.settings, PreprocessSettings(depth_min=odometry.depth_range[0]))
-            self.odometry.give_up(first, None, Verdict.LOST, "the next frame does not fit it")
-            return self._start(view)
+        if sum(placement.keyframe is not None for placement in odometry.placements) == 1:
+            return self._restart(view)
         return self._give_up(frame, problem)
 
     def skip(self, index: int, error: Exception) -> TrackedFrame:
@@ -71,9 +69,20 @@ class RgbdTracker(Tracker):
         self.T_world_camera = self.T_world_first
         return self.odometry.place(view, Verdict.TRACKED, np.eye(4))
 
+    def _restart(self, view: View) -> TrackedFrame:
+        """Begin with this view: nothing ever fitted the first one."""
+        before, self.odometry = self.odometry, KeyframeOdometry(self.settings, self.preprocess)
+        for placement in before.placements:
+            lost = placement.tracked
+            if placement.keyframe is not None:
+                lost = replace(lost, verdict=Verdict.LOST, T_world_camera=None, keyframe=None, message="no other frame fits it")
+            self.odometry.placements.append(Placement(lost))
+        self.lost, self.motion = False, np.eye(4)
+        return self._start(view)
+
     def _align(self, view: View) -> tuple[Registration | None, str]:
         """Alignment to the reference keyframe from where the camera may be, the likeliest guess first."""
-        reference, problem = self.odometry.keyframes.items[self.odometry.reference], ""
+        problem = ""
         guesses = [lambda: self.T_world_camera @ self.motion, lambda: self.T_world_camera, lambda: self._by_features(view)]
         for guess in guesses[1 if self.lost else 0:]:
             if (T_world_camera := guess()) is None:

@@ -1,0 +1,55 @@
+"""Options of commands that need camera poses: where they come from."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from ..config import Config
+from ..datasets import Dataset
+from ..terminal import frame_progress
+from .recording import RecordingOptions
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TrackingOptions:
+    """Where camera poses come from."""
+
+    tracking: Literal["given", "external", "internal", "rgbd"] = field(default="given", kw_only=True)
+    """Camera poses. given: the recording's; external: from --trajectory; internal: either of them, refined; rgbd: found from the
+    frames alone."""
+    trajectory: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(default=None, kw_only=True)
+    """Poses of another program: TUM, KITTI or Replica file, or a folder of one matrix a frame."""
+    interpolate: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
+    """Fill gaps of up to a second between the poses of --trajectory."""
+
+    def track(self, recording: RecordingOptions, settings: Config, directory: Path,
+              stop: Callable[[], bool]) -> tuple[Dataset, dict[str, object]]:
+        """The frames that are asked for with their poses, and what to say of them in the metrics.
+
+        All frames between the first and the last are tracked, whatever `--every` leaves for the map: small steps are easier.
+        Poses are written to tracking.csv and trajectory.txt at once, so that they outlive whatever comes after.
+        """
+        from .. import runtime
+        from ..io import write_trajectory
+        from ..results import TRACKING_FILE
+        from ..tracking import make_tracker
+        from ..tracking.sequence import PosedFrames, track_sequence, write_tracking
+
+        frames = replace(recording, every=1).frames()
+        tracker = make_tracker(self.tracking, settings.tracking, settings.preprocess, trajectory=self.trajectory,
+                               interpolate=self.interpolate, max_difference=recording.max_difference)
+        runtime.init(settings.device, threads=settings.threads or None)
+        logger.info("tracking: %s", self.tracking)
+        with frame_progress(len(frames)) as on_frame:
+            result = track_sequence(frames, tracker, stop=stop, on_frame=on_frame)
+        write_tracking(directory / TRACKING_FILE, result)
+        write_trajectory(directory / "trajectory.txt", result.trajectory)
+        return PosedFrames(frames, result)[::recording.every], {"mode": self.tracking, **result.details}

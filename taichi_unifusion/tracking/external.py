@@ -1,0 +1,92 @@
+"""Poses from a trajectory file of any SLAM system, joined to the frames by time stamp or number (Sec. V-A.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..datasets.association import check_max_difference, nearest
+from ..errors import DatasetError
+from ..types import Frame
+from . import se3
+from .base import TrackedFrame, Tracker, TrackingResult, Verdict
+from .trajectory_files import ExternalPoses
+
+MAX_DIFFERENCE = 0.02       # [s] between a frame and its pose, as TUM's benchmark has it
+LONGEST_GAP = 1.0, 30.0     # [s] or frames; a longer gap is not interpolated: nobody knows what the camera did in it
+
+
+class ExternalPoseTracker(Tracker):
+    """Takes poses from a file; frames without one have none, unless `interpolate` fills short gaps."""
+
+    uses_given_poses = False
+
+    def __init__(self, poses: ExternalPoses, interpolate: bool = False, max_difference: float = MAX_DIFFERENCE) -> None:
+        check_max_difference(max_difference)
+        self.poses, self.interpolate, self.max_difference = poses, interpolate, max_difference
+        self.frames: list[TrackedFrame] = []
+
+    def track(self, frame: Frame) -> TrackedFrame:
+        verdict, pose, message = self.pose_of(frame)
+        self.frames.append(TrackedFrame(frame.index, verdict, pose, frame.timestamp, message=message))
+        return self.frames[-1]
+
+    def pose_of(self, frame: Frame) -> tuple[Verdict, NDArray[np.float64] | None, str]:
+        """Verdict and T_world_camera of a frame, or None and why."""
+        poses = self.poses
+        key, unit, tolerance, longest = self._key(frame)
+        at = int(nearest(poses.keys, np.array([key]))[0])
+        gap = abs(poses.keys[at] - key)
+        if gap <= tolerance:
+            return Verdict.GIVEN, poses.T_world_camera[at], ""
+        after = int(np.searchsorted(poses.keys, key))
+        inside = 0 < after < len(poses.keys)
+        if self.interpolate and inside and poses.keys[after] - poses.keys[after - 1] <= longest:
+            between = poses.T_world_camera[after - 1], poses.T_world_camera[after]
+            share = (key - poses.keys[after - 1]) / (poses.keys[after] - poses.keys[after - 1])
+            return Verdict.INTERPOLATED, interpolate(*between, share), ""
+        return Verdict.MISSING, None, f"{poses.source}: the nearest pose is {gap:g} {unit} away"
+
+    def _key(self, frame: Frame) -> tuple[float, str, float, float]:
+        """What to look for: number or time stamp, its unit, how far off it may be, the longest gap to interpolate."""
+        if not self.poses.by_time:
+            return float(frame.index), "frames", 0.0, LONGEST_GAP[1]
+        if frame.timestamp is None:  # frame numbers stand in for time stamps, as in a trajectory.txt of ours
+            return float(frame.index), "frames", 1e-6, LONGEST_GAP[1]
+        return frame.timestamp, "s", self.max_difference, LONGEST_GAP[0]
+
+    def skip(self, index: int, error: Exception) -> TrackedFrame:
+        self.frames.append(super().skip(index, error))
+        return self.frames[-1]
+
+    def finish(self) -> TrackingResult:
+        if not any(frame.T_world_camera is not None for frame in self.frames) and self.frames:
+            raise DatasetError(f"{self.poses.source}: none of its {len(self.poses.keys)} poses belongs to a frame; its "
+                               f"{'time stamps' if self.poses.by_time else 'frame numbers'} run from {self.poses.keys[0]:g} to "
+                               f"{self.poses.keys[-1]:g}, those of the frames from {self._key_of(self.frames[0])} to "
+                               f"{self._key_of(self.frames[-1])}")
+        return TrackingResult(tuple(self.frames), details={"trajectory": self.poses.source, "gaps": gaps(self.frames)})
+
+    def _key_of(self, frame: TrackedFrame) -> str:
+        by_time = self.poses.by_time and frame.timestamp is not None
+        return f"{frame.timestamp if by_time else frame.index:g}"
+
+
+def interpolate(T_a: NDArray, T_b: NDArray, share: float) -> NDArray[np.float64]:
+    """The pose at `share` (0..1) of the way from T_a to T_b at constant velocity: a screw motion."""
+    return se3.normalized(T_a @ se3.exp(share * se3.log(se3.inverse(T_a) @ T_b)))
+
+
+def gaps(frames: Sequence[TrackedFrame]) -> list[str]:
+    """Runs of frames without a pose, as 'first-last' or a single number."""
+    runs: list[list[int]] = []
+    before = True  # whether the frame before has a pose
+    for frame in frames:
+        if frame.T_world_camera is None:
+            if before:
+                runs.append([frame.index, frame.index])
+            runs[-1][1] = frame.index
+        before = frame.T_world_camera is not None
+    return [str(first) if first == last else f"{first}-{last}" for first, last in runs]

@@ -1,0 +1,101 @@
+"""A tracker over a whole sequence, and the sequence with the poses that it found."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+from ..datasets import Dataset, DatasetView
+from ..errors import FrameError, PoseError
+from ..io import atomic_write
+from ..loading import index_in_recording, load_ahead
+from ..run_log import name_of
+from ..types import Frame
+from .base import TrackedFrame, Tracker, TrackingResult, Verdict
+from .external import gaps
+
+logger = logging.getLogger(__name__)
+
+COLUMNS = ("frame", "timestamp", "verdict", "fitness", "rmse_m", "keyframe", "message")
+NO_POSE = (Verdict.LOST, Verdict.MISSING, Verdict.UNREADABLE)
+
+
+def track_sequence(sequence: Dataset, tracker: Tracker, *, stop: Callable[[], bool] = lambda: False,
+                   on_frame: Callable[[int, int], None] = lambda done, total: None) -> TrackingResult:
+    """Poses of all frames, final; frames that cannot be loaded or tracked are in it with their reason, and said."""
+    started, interrupted = time.perf_counter(), False
+    frames = sequence if tracker.uses_given_poses else sequence.without_poses()
+    for i, load in enumerate(load_ahead(frames)):
+        if interrupted := stop():
+            break
+        try:
+            tracked = tracker.track(load())
+        except FrameError as error:  # of loading: trackers do not raise for a bad frame
+            tracked = tracker.skip(index_in_recording(frames, i), error)
+        if tracked.verdict is Verdict.RELOCALISED:
+            logger.info("frame %d: found again at keyframe %s", tracked.index, tracked.keyframe)
+        on_frame(i + 1, len(sequence))
+    result = tracker.finish()
+    seconds = time.perf_counter() - started
+    details = {**result.details, "verdicts": result.counts, "seconds": round(seconds, 3)}
+    return replace(result, details={**details, "warnings": _warn(result)}, interrupted=interrupted)
+
+
+def _warn(result: TrackingResult) -> list[str]:
+    """Say once for every reason which frames have no pose, and which kept one that was not refined."""
+    sentences = []
+    for verdict in (*NO_POSE, Verdict.PRIOR_KEPT):
+        members = {frame.index for frame in result.frames if frame.verdict is verdict}
+        if not members:
+            continue
+        first = next(frame for frame in result.frames if frame.verdict is verdict)
+        runs = gaps([replace(frame, T_world_camera=None) if frame.index in members else replace(frame, T_world_camera=first)
+                     for frame in result.frames])
+        what = "keep the pose that was given" if verdict is Verdict.PRIOR_KEPT else f"are not mapped ({verdict})"
+        sentences.append(f"tracking: {len(members)} of {len(result.frames)} frames {what}: {_shortened(runs)} "
+                         f"(first: {first.message})")
+    for sentence in sentences:
+        logger.warning("%s", sentence)
+    return sentences
+
+
+def _shortened(runs: list[str], most: int = 8) -> str:
+    return ", ".join(runs[:most]) + (f" and {len(runs) - most} more" if len(runs) > most else "")
+
+
+class PosedFrames(DatasetView):
+    """The frames of a sequence with the poses that a tracker found; one without a pose raises PoseError that says why."""
+
+    def __init__(self, sequence: Dataset, tracking: TrackingResult) -> None:
+        frames = sequence.without_poses()
+        super().__init__(frames, range(len(tracking.frames)))
+        self.tracked: tuple[TrackedFrame, ...] = tracking.frames
+
+    def load(self, index: int) -> Frame:
+        frame, tracked = super().load(index), self.tracked[index]
+        if tracked.T_world_camera is None:
+            raise PoseError(f"{name_of(frame)}: {tracked.verdict}, {tracked.message}")
+        return replace(frame, T_world_camera=tracked.T_world_camera)
+
+
+def write_tracking(path: Path, result: TrackingResult) -> None:
+    """Write what is known about every frame as CSV, atomically."""
+    text = StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS)
+    for frame in result.frames:
+        table.writerow([frame.index, _number(frame.timestamp, "r"), frame.verdict, _number(frame.fitness, ".4f"),
+                        _number(frame.rmse, ".6f"), "" if frame.keyframe is None else frame.keyframe, frame.message])
+    with atomic_write(path) as temporary:
+        temporary.write_text(text.getvalue(), encoding="utf-8")
+
+
+def _number(value: float | None, form: str) -> str:
+    if value is None:
+        return ""
+    return repr(float(value)) if form == "r" else format(value, form)
