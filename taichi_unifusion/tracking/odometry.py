@@ -21,7 +21,8 @@ from .registration import Registration, Target, register
 
 MIN_SURFELS = 0.03      # share of the image
 MIN_OVERLAP = 0.25
-MIN_AGREEMENT = 0.6     # of what is in view
+MIN_AGREEMENT = 0.65    # of what is in view; right alignments leave 0.84 to 0.98
+SURE_AGREEMENT = 0.8    # where nobody knows how far the camera went
 MAX_UNCERTAINTY = 0.015  # [m] of the translation in its weakest direction; rooms leave 0.002 to 0.008
 MAX_CORRECTION = 0.3, np.radians(20)  # [m, rad] farther from the guess alignment only goes astray
 
@@ -76,14 +77,15 @@ class KeyframeOdometry:
 
         return View(frame, reduced, build_pyramid(reduced), features)
 
-    def align(self, view: View, T_world_camera: NDArray, window: int = 1) -> tuple[Registration, str]:
+    def align(self, view: View, T_world_camera: NDArray, window: int = 1,
+              agreement: float = MIN_AGREEMENT) -> tuple[Registration, str]:
         """The view relative to the reference keyframe, from a guess, and why that is not to be trusted, if so."""
         poses, newest = self.keyframes.T_world_keyframe, self.reference
         targets = [Target(self.keyframes.pyramid(k), se3.inverse(poses[k]) @ poses[newest])
                    for k in range(max(0, newest - window + 1), newest + 1)]
         guess = se3.inverse(poses[newest]) @ T_world_camera
         found = register(view.pyramid, targets, guess, self.settings.photometric_weight)
-        return found, problem_of(found, guess)
+        return found, problem_of(found, guess, agreement)
 
     def add_keyframe(self, view: View, T_world_camera: NDArray, registration: Registration | None) -> int:
         """Make the view a keyframe; `registration` is its alignment to the reference keyframe, whose place it takes."""
@@ -153,12 +155,12 @@ class KeyframeOdometry:
         return TrackingResult(tuple(frames), tuple(indices), loops, details)
 
 
-def problem_of(found: Registration, guess: NDArray) -> str:
+def problem_of(found: Registration, guess: NDArray, agreement: float = MIN_AGREEMENT) -> str:
     """Why an alignment is not to be trusted, or nothing."""
     distance, angle = se3.distance(guess, found.T_target_source)
     if found.overlap < MIN_OVERLAP:
         return f"only {found.overlap:.0%} of the frame overlaps its keyframe"
-    if found.agreement < MIN_AGREEMENT:
+    if found.agreement < agreement:
         return f"only {found.agreement:.0%} of the overlap lies on the surface that was seen before"
     if found.weakest > MAX_UNCERTAINTY:
         return "what the frame sees does not tell where the camera is (a blank wall?)"

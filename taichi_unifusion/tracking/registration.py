@@ -13,12 +13,13 @@ from .pyramid import SurfelPyramid
 
 ITERATIONS = (8, 10, 12)      # at most, by level, finest first
 GATES = (0.04, 0.08, 0.16)    # [m] farthest distance of an inlier from the other's plane
+STEPS = (2, 1, 1)             # every so manieth pixel of every so manieth row of the source is used
 MAX_ANGLE = 25.0              # [degrees] between the normals of inliers
 ROBUST_WIDTH = 1.0            # [standard deviations] a distance that counts half
 CONVERGED = 1e-4              # [m, rad] a step below it ends a level
 FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.005  # of intensities in [0, 1]
 DAMPING = 1e-9                # of the mean diagonal: keeps a blind direction solvable
-CORRELATION = 400.0           # neighbouring pixels err alike: so many of them count as one
+CORRELATION = 100.0           # neighbouring pixels err alike: so many of those used count as one
 
 
 @dataclass(frozen=True)
@@ -102,8 +103,9 @@ def _sum(source: SurfelPyramid, targets: Sequence[Target], T_reference_source: N
         other = target.pyramid.levels[level]
         intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in (image.camera, other.camera)], np.float32)
         T = np.ascontiguousarray((target.T_target_reference @ T_reference_source)[:3], np.float32)
-        sums = np.empty((-(-image.camera.height // kernels.BLOCK_ROWS), kernels.SUMS), np.float32)
-        kernels.sum_normal_equations(image.surfels, other.surfels, intrinsics, T, 1, limits, sums)
+        rows = -(-image.camera.height // STEPS[level])
+        sums = np.empty((-(-rows // kernels.BLOCK_ROWS), kernels.SUMS), np.float32)
+        kernels.sum_normal_equations(image.surfels, other.surfels, intrinsics, T, STEPS[level], limits, sums)
         total = sums.sum(axis=0, dtype=np.float64)
         A = se3.adjoint(target.T_target_reference)
         H += A.T @ _symmetric(total[:kernels.H_SIZE]) @ A

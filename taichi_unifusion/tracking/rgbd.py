@@ -18,7 +18,7 @@ from . import se3
 from .base import TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
 from .features import locate, most_similar
 from .loop_closure import believable
-from .odometry import KeyframeOdometry, Placement, View
+from .odometry import MIN_AGREEMENT, SURE_AGREEMENT, KeyframeOdometry, Placement, View
 from .registration import Registration, register
 
 CANDIDATES = 3  # keyframes that a lost frame is compared with
@@ -84,10 +84,11 @@ class RgbdTracker(Tracker):
         """Alignment to the reference keyframe from where the camera may be, the likeliest guess first."""
         problem = ""
         guesses = [lambda: self.T_world_camera @ self.motion, lambda: self.T_world_camera, lambda: self._by_features(view)]
-        for guess in guesses[1 if self.lost else 0:]:
+        for guess in guesses[:0:-1] if self.lost else guesses:  # after a loss nobody knows how far the camera went
             if (T_world_camera := guess()) is None:
                 continue
-            found, wrong = self.odometry.align(view, T_world_camera, self.settings.window)
+            found, wrong = self.odometry.align(view, T_world_camera, self.settings.window,
+                                               SURE_AGREEMENT if self.lost else MIN_AGREEMENT)
             if not wrong:
                 return found, ""
             problem = problem or wrong
