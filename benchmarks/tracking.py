@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import tracking_peers as peers
@@ -111,7 +112,8 @@ def refine(frames, trials: int, apart: int) -> str:
             cloud = time.process_time()
             pyramid(a), pyramid(b)
             middle = time.process_time()
-            peers.colored_icp(a, b, guess)
+            with suppress(RuntimeError):  # it raises where it finds no correspondence
+                peers.colored_icp(a, b, guess)
             theirs.append((1e3 * (middle - cloud), 1e3 * (time.process_time() - middle)))
     errors, theirs = np.array(errors), np.array(theirs)
     both = np.median(times) + np.median(theirs[:, 0])

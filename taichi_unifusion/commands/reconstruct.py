@@ -68,7 +68,7 @@ def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop:
     from ..results import TRACKING_FILE, write_results
 
     about, written = {"recording": {**options.about, "frames": len(frames)}}, []
-    if options.tracking != "given":
+    if options.tracked:
         frames, about["tracking"] = options.track(options, options.settings, directory, stop)
         written = [TRACKING_FILE]
     pipeline = Pipeline(options.settings, encoder=encoder)

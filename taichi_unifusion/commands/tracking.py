@@ -30,6 +30,11 @@ class TrackingOptions:
     interpolate: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
     """Fill gaps of up to a second between the poses of --trajectory."""
 
+    @property
+    def tracked(self) -> bool:
+        """Whether poses come from elsewhere than the recording, or are meant to."""
+        return self.tracking != "given" or self.trajectory is not None or self.interpolate
+
     def track(self, recording: RecordingOptions, settings: Config, directory: Path,
               stop: Callable[[], bool]) -> tuple[Dataset, dict[str, object]]:
         """The frames that are asked for with their poses, and what to say of them in the metrics.

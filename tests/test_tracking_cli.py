@@ -1,0 +1,84 @@
+"""`unifusion reconstruct --tracking`: what a user without poses gets."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from tiny_recording import FLAGS
+
+from taichi_unifusion import cli
+from taichi_unifusion.datasets.synthetic import SyntheticRoom
+from taichi_unifusion.io import read_trajectory, write_trajectory
+from taichi_unifusion.tracking import se3
+from taichi_unifusion.types import Trajectory
+
+FEW = ["reconstruct", "synthetic", "--end", "3", *FLAGS]
+NEAR = 0.01  # [m] of three frames of noisy depth
+
+
+def written(out) -> tuple[dict, list[dict], np.ndarray]:
+    """Metrics, rows of tracking.csv and poses of a results folder."""
+    with open(out / "tracking.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return json.loads((out / "metrics.json").read_text()), rows, read_trajectory(out / "trajectory.txt").T_world_camera
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    out = tmp_path_factory.mktemp("results") / "rgbd"
+    assert cli.main([*FEW, "--tracking", "rgbd", "--out", str(out)]) == 0
+    return out
+
+
+def test_frames_alone_give_poses_a_map_and_a_report(found):
+    metrics, rows, poses = written(found)
+    assert metrics["tracking"]["mode"] == "rgbd" and metrics["tracking"]["verdicts"] == {"tracked": 3}
+    assert metrics["frames"]["used"] == 3 and metrics["mesh"]["triangles"] > 1000 and "tracking.csv" in metrics["files"]
+    assert [row["verdict"] for row in rows] == ["tracked"] * 3
+    truth = SyntheticRoom().T_world_camera[:3]
+    ours, theirs = se3.inverse(poses[0]) @ poses, se3.inverse(truth[0]) @ truth
+    assert np.abs(ours - theirs)[:, :3, 3].max() < NEAR
+
+
+def test_a_summary_says_how_poses_were_found(capsys, tmp_path):
+    assert cli.main([*FEW, "--tracking", "internal", "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "tracking internal: 2 refined, 1 prior kept" in said
+
+
+def test_external_poses_and_a_gap(tmp_path, capsys):
+    room = SyntheticRoom()
+    write_trajectory(tmp_path / "slam.txt", Trajectory(np.array([0, 2 / 30]), room.T_world_camera[[0, 2]]))
+    arguments = [*FEW, "--tracking", "external", "--trajectory", str(tmp_path / "slam.txt")]
+    assert cli.main([*arguments, "--out", str(tmp_path / "plain")]) == 0
+    metrics, rows, _ = written(tmp_path / "plain")
+    assert metrics["frames"]["used"] == 2 and metrics["tracking"]["gaps"] == ["1"] and rows[1]["verdict"] == "no pose"
+    assert "1 of 3 frames are not mapped (no pose): 1" in capsys.readouterr().err
+    assert cli.main([*arguments, "--interpolate", "--out", str(tmp_path / "filled")]) == 0
+    metrics, rows, _ = written(tmp_path / "filled")
+    assert metrics["frames"]["used"] == 3 and rows[1]["verdict"] == "interpolated"
+
+
+def test_every_thins_the_map_and_not_the_tracking(tmp_path):
+    assert cli.main([*FEW, "--every", "2", "--tracking", "rgbd", "--out", str(tmp_path)]) == 0
+    metrics, rows, _ = written(tmp_path)
+    assert len(rows) == 3 and metrics["frames"]["used"] == 2
+
+
+def test_results_of_tracking_do_not_outlive_it(found, tmp_path):
+    (tmp_path / "tracking.csv").write_text("of an earlier run")
+    assert cli.main([*FEW, "--out", str(tmp_path)]) == 0
+    assert not (tmp_path / "tracking.csv").exists()
+
+
+@pytest.mark.parametrize(("options", "told"), [
+    (["--tracking", "slam"], "rgbd"), (["--tracking", "external"], "external needs a trajectory file"),
+    (["--tracking", "external", "--trajectory", "nowhere.txt"], "nowhere.txt: no such file"),
+    (["--trajectory", "x.txt"], "given reads no trajectory file"), (["--tracking.window", "0"], "window >= 1"),
+])
+def test_V4_options_that_make_no_sense(options, told, tmp_path, capsys):
+    assert cli.main([*FEW, *options, "--out", str(tmp_path / "out")]) == 2
+    assert told in " ".join(capsys.readouterr().err.replace("│", " ").split())
