@@ -159,6 +159,12 @@ def test_frames_without_colour_are_tracked_by_geometry(walk):
     assert errors(result, walk).max() < 2 * ATE
 
 
+def test_some_frames_without_colour_do_no_harm(walk):
+    frames = [replace(frame, color=None) if i % 2 else frame for i, frame in enumerate(walk[:8])]
+    result = track_sequence(Listed(frames), RgbdTracker())
+    assert verdicts(result) == ["tracked"] * 8 and errors(result, walk).max() < 2 * ATE
+
+
 def test_a_stop_keeps_what_was_tracked(walk):
     seen = []
     result = track_sequence(Listed(walk), RgbdTracker(), stop=lambda: len(seen) == 3, on_frame=lambda *done: seen.append(done))

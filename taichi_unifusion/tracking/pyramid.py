@@ -26,6 +26,7 @@ class ReducedFrame:
     inverse: NDArray[np.float32]    # (h, w) [1/m], 0: none
     intensity: NDArray[np.float16]  # (h, w) in [0, 1]; zero where the frame has no colour
     camera: PinholeCamera           # of these pixels
+    colored: bool                   # False: intensity says nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,7 @@ class SurfelPyramid:
     """A frame as surfel images, finest first, each half the size of the one before."""
 
     levels: tuple[SurfelImage, ...]
+    colored: bool = True  # whether intensities may be compared
 
 
 def reduce_frame(frame: Frame, depth_min: float, depth_max: float) -> ReducedFrame:
@@ -59,7 +61,7 @@ def reduce_frame(frame: Frame, depth_min: float, depth_max: float) -> ReducedFra
     kernels.average_inverse_depth(inverse, factor, EDGE_JUMP, reduced)
     if frame.color is not None:
         kernels.average_color(np.ascontiguousarray(frame.color), factor, intensity)
-    return ReducedFrame(reduced, intensity.astype(np.float16), camera)
+    return ReducedFrame(reduced, intensity.astype(np.float16), camera, frame.color is not None)
 
 
 def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
@@ -87,7 +89,7 @@ def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
         surfels = ti.ndarray(ti.f32, (*inverse.shape, kernels.CHANNELS))
         kernels.pack_surfels(inverse, normals, intensity, surfels)
         levels.append(SurfelImage(surfels, camera))
-    return SurfelPyramid(tuple(levels))
+    return SurfelPyramid(tuple(levels), reduced.colored)
 
 
 def shrunk(camera: PinholeCamera, factor: int) -> PinholeCamera:

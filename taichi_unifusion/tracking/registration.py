@@ -100,6 +100,7 @@ def _sum(source: SurfelPyramid, targets: Sequence[Target], T_reference_source: N
     limits = np.array([GATES[level], np.cos(np.radians(MAX_ANGLE)), ROBUST_WIDTH, sigma, weight], np.float32)
     image = source.levels[level]
     for target in targets:
+        limits[4] = weight if source.colored and target.pyramid.colored else 0.0
         other = target.pyramid.levels[level]
         intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in (image.camera, other.camera)], np.float32)
         T = np.ascontiguousarray((target.T_target_reference @ T_reference_source)[:3], np.float32)
