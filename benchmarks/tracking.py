@@ -8,8 +8,9 @@
     python benchmarks/tracking.py 7scenes PATH --end 300 --refine 100      # a pair of frames, disturbed so many times
 
 ATE is the RMSE of camera positions after the best rigid motion, RPE that of the motion from frame to frame, both against the
-recording's poses; "end" is how far the last camera is off, seen from the first. "agree" needs no truth: the share of what frames ten
-apart see in common that lies within 4 cm at these poses, with normals within 25 degrees. Times are process CPU time of all threads, loading left out: on a busy machine they stay what they are.
+recording's poses; "end" is how far the last camera is off, seen from the first. "agree" needs no truth: the share of what
+frames ten apart see in common that lies within 4 cm at these poses, with normals within 25 degrees. Times are process CPU time of
+all threads, loading left out: a busy machine changes them less than others.
 Open3D and OpenCV get the same frames and intrinsics, and their own defaults.
 """
 
@@ -135,7 +136,8 @@ def refine(frames, trials: int, apart: int) -> str:
             ["median error", f"{np.median(errors[:, 0]):.2f} mm, {np.median(errors[:, 1]):.3f} degrees"],
             ["largest error", f"{errors[:, 0].max():.2f} mm, {errors[:, 1].max():.3f} degrees"],
             ["alignment", f"{np.median(times):.0f} ms"], ["with both pyramids", f"{both:.0f} ms"],
-            ["Open3D colored ICP, three scales", f"{np.median(theirs[:, 1]):.0f} ms, {np.median(theirs[:, 1]) / both:.1f} times as long"]]
+            ["Open3D colored ICP, 3 scales",
+             f"{np.median(theirs[:, 1]):.0f} ms, {np.median(theirs[:, 1]) / both:.1f} times as long"]]
     return format_table(rows)
 
 

@@ -59,10 +59,10 @@ class LegacyHybrid(FrameToFrame):
     def motion(self, source, target) -> np.ndarray:
         import open3d as o3d
 
-        c = self.camera
+        c, options = self.camera, o3d.pipelines.odometry.OdometryOption(depth_max=DEPTH_MAX)
         found, T, _ = o3d.pipelines.odometry.compute_rgbd_odometry(
             source, target, o3d.camera.PinholeCameraIntrinsic(c.width, c.height, c.fx, c.fy, c.cx, c.cy), np.eye(4),
-            o3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm(), o3d.pipelines.odometry.OdometryOption(depth_max=DEPTH_MAX))
+            o3d.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm(), options)
         return T if found else np.eye(4)
 
 

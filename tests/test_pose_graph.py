@@ -142,8 +142,9 @@ def test_open3d_finds_the_same_optimum():
     swap = np.r_[3:6, 0:3]  # theirs: rotation first
     for edge in edges:
         graph.edges.append(graphs.PoseGraphEdge(edge.b, edge.a, edge.T_a_b, edge.information[np.ix_(swap, swap)], False))
+    option = graphs.GlobalOptimizationOption(reference_node=0)
     graphs.global_optimization(graph, graphs.GlobalOptimizationLevenbergMarquardt(),
-                               graphs.GlobalOptimizationConvergenceCriteria(), graphs.GlobalOptimizationOption(reference_node=0))
+                               graphs.GlobalOptimizationConvergenceCriteria(), option)
     theirs = np.array([node.pose for node in graph.nodes])
     ours = optimize(start, edges).T_world_node
     assert errors(start, ours).max() > 0.02

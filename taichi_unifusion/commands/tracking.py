@@ -23,7 +23,7 @@ class TrackingOptions:
     """Where camera poses come from."""
 
     tracking: Literal["given", "external", "internal", "rgbd"] = field(default="given", kw_only=True)
-    """Camera poses. given: the recording's; external: from --trajectory; internal: either of them, refined; rgbd: found from the
+    """Camera poses. given: the recording's; external: from --trajectory; internal: either of them, refined; rgbd: from the
     frames alone."""
     trajectory: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(default=None, kw_only=True)
     """Poses of another program: TUM, KITTI or Replica file, or a folder of one matrix a frame."""

@@ -1,8 +1,8 @@
 """Colored ICP on image pyramids: surfel images, and the 6x6 normal equations of one Gauss-Newton step (Sec. V-A.1).
 
 A *surfel image* holds in every pixel what registration asks of it, side by side in memory: depth, normal, intensity and its
-slopes. Association is projective: a source pixel's point, moved into the target camera, meets the target pixel that it falls in.
-Every block of source rows keeps sums of its own, so that the result does not depend on the order in which threads run.
+slopes. Association is projective: a source pixel's point, moved into the target camera, meets the pixel that it falls in. Every
+block of source rows keeps sums of its own, so that the result does not depend on the order in which threads run.
 """
 
 import taichi as ti

@@ -19,7 +19,8 @@ __all__ = ["MODES", "TrackedFrame", "Tracker", "TrackingResult", "TrackingSettin
 
 
 def make_tracker(mode: str, settings: TrackingSettings | None = None, preprocess: PreprocessSettings | None = None, *,
-                 trajectory: str | Path | None = None, interpolate: bool = False, max_difference: float | None = None) -> Tracker:
+                 trajectory: str | Path | None = None, interpolate: bool = False,
+                 max_difference: float | None = None) -> Tracker:
     """The tracker of that mode; `trajectory` is the file or folder for external, and for internal instead of given poses.
 
     Raises InputError for an unknown mode or a trajectory that is missing or not used, DatasetError where it holds no poses.

@@ -98,7 +98,7 @@ class TrackingSettings:
     """How poses are found and refined."""
 
     photometric_weight: float = 0.1
-    """Weight of colour against geometry when frames are aligned; colour decides what geometry leaves open. 0: geometry alone."""
+    """Weight of colour against geometry when frames are aligned; it decides what geometry leaves open. 0: geometry alone."""
     depth_max: float = 6.0
     """Farthest reading that tracking uses, in metres."""
     keyframe_distance: float = 0.10

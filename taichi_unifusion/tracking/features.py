@@ -79,7 +79,8 @@ def locate(query: Features, other: Features) -> NDArray[np.float64] | None:
     pixels = np.array([query.pixels[match.queryIdx] for match in good], np.float64)
     cv2.setRNGSeed(0)  # the same frames give the same pose
     found, rotation, translation, inliers = cv2.solvePnPRansac(
-        points, pixels, query.K, None, iterationsCount=RANSAC_ITERATIONS, reprojectionError=REPROJECTION, flags=cv2.SOLVEPNP_AP3P)
+        points, pixels, query.K, None, iterationsCount=RANSAC_ITERATIONS, reprojectionError=REPROJECTION,
+        flags=cv2.SOLVEPNP_AP3P)
     if not found or inliers is None or len(inliers) < MIN_MATCHES:
         return None
     T_query_other = np.eye(4)

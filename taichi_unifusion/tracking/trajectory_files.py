@@ -52,7 +52,8 @@ def read_poses(path: str | Path) -> ExternalPoses:
                 raise DatasetError(f"{row.source}: '{row.name}' is not a time stamp")
         return _checked(path, True, [(row.timestamp, row.pose()) for row in stamped])
     if columns not in FORMATS:
-        raise DatasetError(f"{where}: a row has {columns} numbers; known are {', '.join(f'{n}: {FORMATS[n]}' for n in FORMATS)}")
+        known = ", ".join(f"{count}: {name}" for count, name in FORMATS.items())
+        raise DatasetError(f"{where}: a row has {columns} numbers; known are {known}")
     last = ["0", "0", "0", "1"] if columns == 12 else []
     return _checked(path, False, [(number, matrix_from_row(_of_length(words, columns, at) + last, at))
                                   for number, (words, at) in enumerate(rows)])
