@@ -17,6 +17,7 @@ Open3D and OpenCV get the same frames and intrinsics, and their own defaults.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -167,7 +168,10 @@ def main() -> None:
         print(refine(frames, options.refine, options.apart))
         return
     header, truth, pyramids = ["method", "tracked", "ATE cm", "end cm", "RPE cm", "agree %", "median ms", "mean ms"], {}, {}
-    rows = [run(name, frames, truth, pyramids) for name in options.methods]
+    rows = []
+    for name in options.methods:
+        rows.append(run(name, frames, truth, pyramids))
+        print(*rows[-1], sep="  ", file=sys.stderr, flush=True)
     given = ["given poses", f"{len(truth)} of {len(truth)}", "-", "-", "-", agreement(pyramids, truth), "-", "-"]
     print(format_table([header, *rows, given]))
 

@@ -16,7 +16,7 @@ RATIO = 0.8            # best against second-best distance of a match
 REPROJECTION = 6.0     # [px] of a match that supports a pose
 MIN_MATCHES = 12       # that support a pose
 RANSAC_ITERATIONS = 300
-QUERY_FEATURES = 200   # of the strongest, that vote for similar keyframes
+QUERY_FEATURES, STORED_FEATURES = 200, 300  # of the strongest, that vote for similar keyframes, and that are voted for
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +56,10 @@ def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Featur
 
 def most_similar(query: Features, others: Sequence[Features], count: int) -> list[int]:
     """Numbers of the `count` of `others` that most of the query's strongest features find their nearest neighbour in."""
-    sizes = [len(other) for other in others]
+    sizes = [min(len(other), STORED_FEATURES) for other in others]
     if not len(query) or not sum(sizes):
         return []
-    stacked = np.vstack([other.descriptors for other in others])
+    stacked = np.vstack([other.descriptors[:STORED_FEATURES] for other in others])
     owner = np.repeat(np.arange(len(others)), sizes)
     matches = cv2.BFMatcher(cv2.NORM_HAMMING).match(query.descriptors[:QUERY_FEATURES], stacked)
     votes = np.bincount(owner[[match.trainIdx for match in matches]], minlength=len(others))

@@ -9,7 +9,7 @@ from . import se3
 from .features import locate, most_similar
 from .keyframes import Keyframes
 from .pose_graph import Edge
-from .registration import Registration, evaluate, register
+from .registration import Registration, register
 
 NEAR = 6             # keyframes that are neighbours in time
 NEIGHBORS = 2        # of them, so many are aligned beside the one before
@@ -43,13 +43,11 @@ def find_loops(keyframes: Keyframes, number: int, photometric_weight: float, by_
 def _by_overlap(keyframes: Keyframes, number: int, others: range) -> list[int]:
     """Those of `others` that should see what the keyframe sees, most of it first."""
     found = []
-    coarsest = len(keyframes.pyramid(number).levels) - 1
     for other in others:
-        T = se3.inverse(keyframes.T_world_keyframe[other]) @ keyframes.T_world_keyframe[number]
-        if T[2, 2] > 0.3 and np.linalg.norm(T[:3, 3]) < 3.0:  # looks the same way, from not too far
-            overlap = evaluate(keyframes.pyramid(number), keyframes.pyramid(other), T, coarsest).overlap
-            if overlap > MIN_OVERLAP:
-                found.append((-overlap, other))
+        T_other_number = se3.inverse(keyframes.T_world_keyframe[other]) @ keyframes.T_world_keyframe[number]
+        overlap = keyframes.items[number].overlap(keyframes.items[other], T_other_number)
+        if overlap > MIN_OVERLAP:
+            found.append((-overlap, other))
     return [other for _, other in sorted(found)]
 
 

@@ -140,8 +140,7 @@ class KeyframeOdometry:
 
     def result(self, **details) -> TrackingResult:
         """All frames with poses that follow from the optimised keyframes."""
-        if self.settings.loops or self.priors:
-            self.optimize()
+        self.optimize()
         frames = []
         for placement in self.placements:
             pose = None
