@@ -93,6 +93,8 @@ class KeyframeOdometry:
         before, number = self.reference, self.keyframes.add(keyframe, view.pyramid, T_world_camera)
         if registration is not None:
             self.edges.append(Edge.of(before, number, registration))
+            if self.placements[-1].tracked.index == keyframe.index:  # it moves with itself now
+                self.placements[-1] = replace(self.placements[-1], keyframe=number, T_keyframe_camera=np.eye(4))
         self.reference = number
         return number
 
@@ -122,9 +124,9 @@ class KeyframeOdometry:
                 or registration.fitness < s.keyframe_fitness)
 
     def place(self, view: View, verdict: Verdict, T_keyframe_camera: NDArray, registration: Registration | None = None,
-              message: str = "", keyframe: int | None = None) -> TrackedFrame:
-        """Note where a frame lies relative to a keyframe, the reference unless another is named."""
-        keyframe = self.reference if keyframe is None else keyframe
+              message: str = "") -> TrackedFrame:
+        """Note where a frame lies relative to the reference keyframe."""
+        keyframe = self.reference
         T_keyframe_camera = se3.normalized(T_keyframe_camera)
         fit = {} if registration is None else {"fitness": registration.fitness, "rmse": registration.rmse}
         tracked = TrackedFrame(view.frame.index, verdict, self.keyframes.T_world_keyframe[keyframe] @ T_keyframe_camera,

@@ -30,7 +30,6 @@ class Registration:
     fitness: float    # share of the source's surfels that are inliers
     rmse: float       # of the inliers' distances from the target's planes [m]
     overlap: float    # share of the source's surfels that meet surfels of the target
-    surfels: int      # of the source, at the finest level
     information: NDArray[np.float64]  # (6, 6) of a twist on the left of T_target_source
 
     @property
@@ -123,7 +122,7 @@ def _result(T: NDArray, equations: _Equations) -> Registration:
     of, inliers = max(equations.counts[kernels.SOURCE], 1.0), equations.counts[kernels.INLIERS]
     rmse = float(np.sqrt(equations.counts[kernels.SQUARED_DISTANCE] / inliers)) if inliers else float("inf")
     return Registration(np.asarray(T, np.float64), inliers / of, rmse, equations.counts[kernels.IN_VIEW] / of,
-                        int(equations.counts[kernels.SOURCE]), equations.H / CORRELATION)
+                        equations.H / CORRELATION)
 
 
 def _symmetric(upper: NDArray) -> NDArray[np.float64]:
