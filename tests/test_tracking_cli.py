@@ -46,7 +46,7 @@ def test_frames_alone_give_poses_a_map_and_a_report(found):
 def test_a_summary_says_how_poses_were_found(capsys, tmp_path):
     assert cli.main([*FEW, "--tracking", "internal", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
-    assert "tracking internal: 2 refined, 1 prior kept" in said
+    assert "tracking internal: 2 refined, 1 given" in said
 
 
 def test_external_poses_and_a_gap(tmp_path, capsys):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,12 +81,17 @@ def interpolate(T_a: NDArray, T_b: NDArray, share: float) -> NDArray[np.float64]
 
 def gaps(frames: Sequence[TrackedFrame]) -> list[str]:
     """Runs of frames without a pose, as 'first-last' or a single number."""
-    runs: list[list[int]] = []
-    before = True  # whether the frame before has a pose
+    return runs(frames, lambda frame: frame.T_world_camera is None)
+
+
+def runs(frames: Sequence[TrackedFrame], belongs: Callable[[TrackedFrame], bool]) -> list[str]:
+    """Runs of neighbouring frames of a kind, as 'first-last' or a single number."""
+    found: list[list[int]] = []
+    inside = False
     for frame in frames:
-        if frame.T_world_camera is None:
-            if before:
-                runs.append([frame.index, frame.index])
-            runs[-1][1] = frame.index
-        before = frame.T_world_camera is not None
-    return [str(first) if first == last else f"{first}-{last}" for first, last in runs]
+        if belongs(frame):
+            if not inside:
+                found.append([frame.index, frame.index])
+            found[-1][1] = frame.index
+        inside = belongs(frame)
+    return [str(first) if first == last else f"{first}-{last}" for first, last in found]

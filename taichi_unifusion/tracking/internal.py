@@ -38,7 +38,7 @@ class InternalTracker(Tracker):
             return odometry.give_up(given.index, given.timestamp, given.verdict, given.message)
         view = odometry.view(frame)
         if not len(odometry.keyframes):
-            return self._start(view, given, "the first frame")
+            return self._start(view, given, "")
         reference = odometry.reference
         T_reference_prior = se3.inverse(self.T_world_prior[reference]) @ given.T_world_camera
         guess = odometry.keyframes.T_world_keyframe[reference] @ T_reference_prior
@@ -68,10 +68,10 @@ class InternalTracker(Tracker):
             return f"alignment went {100 * distance:.1f} cm and {np.degrees(angle):.1f} degrees away from the given pose"
         return ""
 
-    def _start(self, view: View, given: TrackedFrame, message: str) -> TrackedFrame:
-        """A keyframe that is where it was given; the next ones are aligned to it."""
+    def _start(self, view: View, given: TrackedFrame, problem: str) -> TrackedFrame:
+        """A keyframe that is where it was given, because of a problem or as the first; the next ones are aligned to it."""
         self._add_keyframe(view, given, given.T_world_camera, None)
-        return self.odometry.place(view, Verdict.PRIOR_KEPT, np.eye(4), None, message)
+        return self.odometry.place(view, Verdict.PRIOR_KEPT if problem else given.verdict, np.eye(4), None, problem)
 
     def _add_keyframe(self, view: View, given: TrackedFrame, T_world_camera: NDArray, found: Registration | None) -> None:
         odometry, before = self.odometry, self.odometry.reference

@@ -17,7 +17,7 @@ from ..loading import index_in_recording, load_ahead
 from ..run_log import name_of
 from ..types import Frame
 from .base import TrackedFrame, Tracker, TrackingResult, Verdict
-from .external import gaps
+from .external import runs
 
 logger = logging.getLogger(__name__)
 
@@ -50,22 +50,20 @@ def _warn(result: TrackingResult) -> list[str]:
     """Say once for every reason which frames have no pose, and which kept one that was not refined."""
     sentences = []
     for verdict in (*NO_POSE, Verdict.PRIOR_KEPT):
-        members = {frame.index for frame in result.frames if frame.verdict is verdict}
+        members = [frame for frame in result.frames if frame.verdict is verdict]
         if not members:
             continue
-        first = next(frame for frame in result.frames if frame.verdict is verdict)
-        runs = gaps([replace(frame, T_world_camera=None) if frame.index in members else replace(frame, T_world_camera=first)
-                     for frame in result.frames])
+        where = runs(result.frames, lambda frame, verdict=verdict: frame.verdict is verdict)
         what = "keep the pose that was given" if verdict is Verdict.PRIOR_KEPT else f"are not mapped ({verdict})"
-        sentences.append(f"tracking: {len(members)} of {len(result.frames)} frames {what}: {_shortened(runs)} "
-                         f"(first: {first.message})")
+        sentences.append(f"tracking: {len(members)} of {len(result.frames)} frames {what}: {_shortened(where)} "
+                         f"(first: {members[0].message})")
     for sentence in sentences:
         logger.warning("%s", sentence)
     return sentences
 
 
-def _shortened(runs: list[str], most: int = 8) -> str:
-    return ", ".join(runs[:most]) + (f" and {len(runs) - most} more" if len(runs) > most else "")
+def _shortened(where: list[str], most: int = 8) -> str:
+    return ", ".join(where[:most]) + (f" and {len(where) - most} more" if len(where) > most else "")
 
 
 class PosedFrames(DatasetView):
