@@ -75,7 +75,8 @@ def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop:
     with frame_progress(len(frames)) as on_frame:
         run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
     if not run.steps:
-        logger.warning("stopped before the first frame was done; nothing was written")
+        logger.warning("stopped before the first frame was done; %s",
+                       "tracking.csv and trajectory.txt hold the poses found until then" if written else "nothing was written")
         return INTERRUPTED
     done = len(run.steps) + len(run.skipped)
     if done < len(frames):
