@@ -66,11 +66,16 @@ def vote_cells(encoder, voxels, voxel_size, depth, camera, T_camera_world):
             slope = slopes[cell] @ voxel.F[:, 0]
             steep = np.linalg.norm(slope)
             distance = f[cell] @ voxel.F[:, 0] / max(steep, 1e-6)
-            if steep > 0.2 and abs(distance) < 0.35:
+            if steep > 0.2 and abs(distance) < 0.45:
                 normal = slope / steep
                 p = R @ ((key + center - distance * normal) * voxel_size) + origin
                 votes[key][cell] = vote_of_surface(p, R @ normal, voxel_size, depth, camera)
     return votes
+
+
+def vote_support(support):
+    """Voxel -> (64,) votes of a frame that has no rays: one for every cell that it supports."""
+    return {key: mask.astype(int) for key, mask in support.items()}
 
 
 def add_evidence(evidence, more):

@@ -203,7 +203,7 @@ def test_F4_one_valid_pixel_gives_no_point(at):
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (7, 7), (65, 1)])
 def test_images_smaller_than_a_window_give_no_points(size):
     camera = PinholeCamera(*size, 50.0, 50.0, 0.5, 0.5)
-    cloud = preprocess(Frame(np.ones(size[::-1], np.float32), camera))
+    cloud = preprocess(Frame(np.ones(size[::-1], np.float32), camera), PreprocessSettings(normal_radius=3))
     assert len(cloud) <= 4 and np.isfinite(cloud.points).all()
 
 

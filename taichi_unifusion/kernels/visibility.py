@@ -15,7 +15,7 @@ MOST_VOTES = 127       # votes that a cell can hold, for or against
 SLACK_VOXELS = 0.5     # a reading this far behind a point passes through it [voxels]...
 SLACK_NOISE = 0.003    # ...plus this much [1/m] times its depth squared: two sigma of a Kinect
 GRAZING = 0.1          # cosine; rays flatter on a surface than this cannot say that they pass through it
-ALONE = 0.35           # the surface of a cell lies within this distance of its centre [voxels]
+ALONE = 0.45           # the surface of a cell lies within this distance of its centre [voxels]
 FLAT = 0.2             # a field with a smaller slope than this has no surface to speak of
 
 
@@ -126,6 +126,23 @@ def vote_cells(
                         vote = surface_vote(corner + R @ x, R @ normal / voxel_size, voxel_size, depth, fx, fy, cx, cy)
                 if vote != 0:
                     add_votes(evidence, s, cell, sign * vote)
+
+
+@ti.kernel
+def vote_support(
+    # in:
+    blocks: ti.i32,
+    keys: Ints2,            # (B, 3)
+    support: Masks2,        # (B, 2) cells that the frame supports
+    slot: ti.template(),
+    sign: ti.i32,
+    # out:
+    evidence: Votes2,       # (S, 64) += 1 where the frame supports the cell: it has no rays to ask
+):
+    for b, cell in ti.ndrange(blocks, BLOCK_CELLS):
+        s = slot[row3(keys, b) + INDEX_HALF] - 1
+        if s >= 0 and (support[b, cell // 32] >> ti.cast(31 - cell % 32, ti.u32)) & 1 != 0:
+            add_votes(evidence, s, cell, sign)
 
 
 @ti.kernel

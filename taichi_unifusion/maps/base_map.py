@@ -75,27 +75,28 @@ class BaseMap(ABC):
             return Integration(0, 0, len(self))
         blocks = self._encode(cloud)                 # local LIM: F', w' of every voxel that the cloud touches
         encoded = self._regressor.fuse(blocks)       # global LIM, Eq. 19
-        self._vote(cloud, 1)
+        self._vote(cloud, blocks, 1)
         return Integration(len(cloud), encoded, len(self))
 
     def remove(self, cloud: PointCloud) -> Integration:
         """Take a cloud out again that was integrated, for example to integrate it at a better pose; errors as `integrate`.
 
-        Latents and weights become what they were without it, up to rounding; support for surface stays.
+        Latents and weights become what they were without it, up to rounding; support for surface stays, and of the evidence
+        against it what frames in between changed. Removing what was never integrated spoils the voxels that it touches.
         """
         runtime.check_alive(self._grid.runtime)
         cloud = _finite_rows(cloud, self._observed(cloud))
         if len(cloud) == 0:
             return Integration(0, 0, len(self))
         blocks = self._encode(cloud)  # before anything changes: it refuses clouds
-        self._vote(cloud, -1)
+        self._vote(cloud, blocks, -1)
         encoded = self._regressor.take_out(blocks)
         return Integration(len(cloud), encoded, len(self))
 
     def _encode(self, cloud: PointCloud) -> FrameBlocks:
         return self._encode_cells(cloud) if self.settings.sampling == "cells" else self._encode_points(cloud)
 
-    def _vote(self, cloud: PointCloud, sign: int) -> None:
+    def _vote(self, cloud: PointCloud, blocks: FrameBlocks, sign: int) -> None:
         """What a map learns from where the cloud was seen from; most learn nothing."""
 
     @abstractmethod

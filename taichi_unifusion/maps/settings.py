@@ -82,10 +82,12 @@ class SurfaceSettings(MapSettings):
 class PropertySettings(MapSettings):
     """Settings of a property map (Sec. IV-C)."""
 
-    voxel_size: float = 0.02
-    """Voxel edge in metres; a latent describes a cube of twice this edge."""
-    noise: float = 0.3
+    voxel_size: float = 0.025
+    """Voxel edge in metres; a latent describes a cube of twice this edge. Smaller is sharper where colour fits depth well."""
+    noise: float = 0.1
     """Observation noise d of the regression (Eq. 18) relative to the kernel's variance; larger is smoother."""
+    min_points: int = 1
+    """Voxels with fewer samples in a frame are left out of that frame."""
     encoder: EncoderSettings = field(default_factory=lambda: EncoderSettings(rank=12))
     """The position encoding; 12 eigenpairs render as well as 20 here, and half the work."""
     prior: Literal["mean", "zero"] = "mean"

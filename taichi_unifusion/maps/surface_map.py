@@ -74,10 +74,12 @@ class SurfaceMap(BaseMap):
         self._samples.bin_support(samples, self.voxel_size, self.settings.support_points)
         return self._samples
 
-    def _vote(self, cloud: PointCloud, sign: int) -> None:
-        """Let the frame's rays vote on what they saw and what they passed through."""
+    def _vote(self, cloud: PointCloud, blocks: FrameBlocks, sign: int) -> None:
+        """Let the frame's rays vote on what they saw and what they passed through; without rays, its points on what they are."""
         grid, view = self._grid, cloud.view
-        if self.settings.carve and view is not None:
+        if self.settings.carve and view is None:
+            visibility.vote_support(blocks.count, blocks.keys, blocks.support, grid.slot, sign, grid.evidence)
+        elif self.settings.carve:
             camera = view.camera
             visibility.vote_cells(self.settings.encoder.rank, grid.count, grid.keys, grid.masks, grid.latents,
                                   self._regressor.cell_gradients, self.voxel_size, view.depth,
