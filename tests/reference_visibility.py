@@ -84,7 +84,7 @@ def add_evidence(evidence, more):
 
 
 def interpolate_evidence(evidence, masks, x):
-    """(N,) tent-weighted mean over the eight nearest cells that have support, 0 where none has; x [voxels]."""
+    """(N,) tent-weighted mean over the eight nearest cells that have support, 1 where none has; x [voxels]."""
     values = np.zeros(len(x))
     for n, point in enumerate(x * CELLS - 0.5):
         corner, total, weight = np.floor(point).astype(int), 0.0, 0.0
@@ -93,5 +93,5 @@ def interpolate_evidence(evidence, masks, x):
             if key in evidence and masks[key][cell]:
                 tent = np.prod(1 - np.abs(point - at))
                 total, weight = total + tent * evidence[key][cell], weight + tent
-        values[n] = total / weight if weight > 1e-3 else 0.0
+        values[n] = total / weight if weight > 1e-6 else 1.0
     return values

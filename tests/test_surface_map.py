@@ -18,8 +18,8 @@ TILTED_U, TILTED_V = np.array([0.4, 0.0, 0.15]), np.array([-0.05, 0.35, 0.1])
 NORMAL = np.cross(TILTED_U, TILTED_V) / np.linalg.norm(np.cross(TILTED_U, TILTED_V))
 
 # Bounds in metres at 5 cm voxels and d = 1, with a margin over what was measured.
-ON_SPHERE, ON_SPHERE_MEAN = 0.0025, 0.0008  # vertices; regularisation rounds the curvature off
-ON_PLANE = 0.0010                           # vertices on a tilted plane
+ON_SPHERE, ON_SPHERE_MEAN = 0.003, 0.0008  # vertices; regularisation rounds the curvature off
+ON_PLANE = 0.0015                           # vertices on a tilted plane
 ON_BOX_FACE, ON_BOX_EDGE = 0.0030, 0.012    # a voxel's smooth latent rounds edges off
 NEAR_FIELD = 0.006                          # sdf within 0.15 voxels of the surface, where samples lie
 NORMAL_ANGLE = 8.0                          # degrees, of mesh normals on the sphere

@@ -27,6 +27,7 @@ ENCODER = EncoderSettings(rank=8, anchors=64)
 FLIPPED = 1e-3      # share of cells in which float32 puts a pixel, or a threshold, on the other side
 EVIDENCE = 1e-4     # [votes] of float32 weights about 1 and votes about 100
 AT_EDGE = 0.1       # [voxels] mean distance of the mesh's border from the true edge, with `carve`...
+RIM = 0.1  # of the area: cells half outside of the only image have no vote
 NEAR_EDGE = 0.25    # ...and of 95 % of it: a cell is 0.25 voxels
 BEYOND_EDGE = 0.6   # [voxels] without it, the surface goes on to where voxels end: the same 95 %
 AREA = 1e-4         # relative: cuts go through vertices that are this near, in edges
@@ -152,7 +153,7 @@ def test_interpolate_evidence_equals_its_twin():
     by_key = {tuple(key): s for key, s in zip(keys.tolist(), slots, strict=True)}
     wanted = twin.interpolate_evidence({key: evidence[s] for key, s in by_key.items()},
                                        {key: masks[s] for key, s in by_key.items()}, points.astype(float) / VS)
-    assert 0.2 < (wanted == 0).mean() < 0.9
+    assert 0.2 < (wanted == 1).mean() < 0.9
     assert (np.abs(values - wanted) > EVIDENCE * 127).mean() < FLIPPED
 
 
@@ -227,7 +228,7 @@ def test_what_a_single_frame_saw_stays_when_others_do_not_see_it():
     seen = clouds_of(9.0, POSES[:1])[0]
     alone = mapped([seen])
     area = area_and_volume(*_triangles(alone))[0]
-    assert area == pytest.approx(area_and_volume(*_triangles(mapped([seen], carve=False)))[0], rel=0.05)
+    assert area == pytest.approx(area_and_volume(*_triangles(mapped([seen], carve=False)))[0], rel=RIM)
     for k in range(3):
         away = T_WORLD_SCENE @ pose((0, 0, 0), np.pi + 0.1 * k)
         alone.integrate(preprocess(plane_before_wall(np.eye(4), 9.0)).transformed(away))

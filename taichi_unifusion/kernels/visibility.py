@@ -16,6 +16,7 @@ SLACK_VOXELS = 0.5     # a reading this far behind a point passes through it [vo
 SLACK_NOISE = 0.003    # ...plus this much [1/m] times its depth squared: two sigma of a Kinect
 GRAZING = 0.1          # cosine; rays flatter on a surface than this cannot say that they pass through it
 ALONE = 0.45           # the surface of a cell lies within this distance of its centre [voxels]
+LEAST_TENT = 1e-6      # of the cells around a point; with less they say nothing
 FLAT = 0.2             # a field with a smaller slope than this has no surface to speak of
 
 
@@ -166,7 +167,7 @@ def interpolate_evidence(
     masks: Masks2,       # (S, 2)
     evidence: Votes2,    # (S, 64)
     # out:
-    values: Floats1,     # (N,) between the centres of the cells with support around the point; 0 where there is none
+    values: Floats1,     # (N,) between the centres of the cells with support around; 1 where none is, as if one frame saw it
 ):
     for n in range(points.shape[0]):
         x = row3(points, n) * (per_meter * CELLS) - 0.5
@@ -185,4 +186,4 @@ def interpolate_evidence(
                         tent *= part[d] if step[d] == 1 else 1.0 - part[d]
                     total += tent * evidence[s, cell]
                     weight += tent
-        values[n] = total / weight if weight > 1e-3 else 0.0
+        values[n] = total / weight if weight > LEAST_TENT else 1.0
