@@ -84,13 +84,13 @@ def add_evidence(evidence, more):
 
 
 def interpolate_evidence(evidence, masks, x):
-    """(N,) tent-weighted mean over the eight nearest cells that have support, 1 where none has; x [voxels]."""
+    """(N,) tent-weighted mean over the eight nearest cells that have support or were seen through, 1 where none is; x [voxels]."""
     values = np.zeros(len(x))
     for n, point in enumerate(x * CELLS - 0.5):
         corner, total, weight = np.floor(point).astype(int), 0.0, 0.0
         for at in corner + CORNERS:
             key, cell = tuple((at // CELLS).tolist()), cell_number(at)
-            if key in evidence and masks[key][cell]:
+            if key in evidence and (masks[key][cell] or evidence[key][cell] < 0):
                 tent = np.prod(1 - np.abs(point - at))
                 total, weight = total + tent * evidence[key][cell], weight + tent
         values[n] = total / weight if weight > 1e-6 else 1.0

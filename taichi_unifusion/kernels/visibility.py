@@ -167,7 +167,7 @@ def interpolate_evidence(
     masks: Masks2,       # (S, 2)
     evidence: Votes2,    # (S, 64)
     # out:
-    values: Floats1,     # (N,) between the centres of the cells with support around; 1 where none is, as if one frame saw it
+    values: Floats1,     # (N,) between the cells around that have support or are seen through; 1 where none is, as if seen once
 ):
     for n in range(points.shape[0]):
         x = row3(points, n) * (per_meter * CELLS) - 0.5
@@ -180,7 +180,8 @@ def interpolate_evidence(
             s = slot[ti.math.clamp(at >> 2, -INDEX_HALF, INDEX_HALF - 1) + INDEX_HALF] - 1
             if s >= 0:
                 cell = ((at[0] & 3) * CELLS + (at[1] & 3)) * CELLS + (at[2] & 3)
-                if (masks[s, cell // 32] >> ti.cast(31 - cell % 32, ti.u32)) & 1 != 0:
+                supported = (masks[s, cell // 32] >> ti.cast(31 - cell % 32, ti.u32)) & 1 != 0
+                if supported or evidence[s, cell] < 0:
                     tent = 1.0
                     for d in ti.static(range(3)):
                         tent *= part[d] if step[d] == 1 else 1.0 - part[d]

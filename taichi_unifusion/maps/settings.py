@@ -57,7 +57,7 @@ class SurfaceSettings(MapSettings):
     """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one frame (fewer where a whole
     voxel has few); 0: everywhere in voxels that held any."""
 
-    support_closing: int = 20
+    support_closing: int = 14
     """Cells with at least this many of their 26 neighbours seen count as seen, which closes pinholes; 27: none, 1: a rim all
     around."""
     carve: bool = True
