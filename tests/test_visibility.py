@@ -28,7 +28,7 @@ FLIPPED = 1e-3      # share of cells in which float32 puts a pixel, or a thresho
 EVIDENCE = 1e-4     # [votes] of float32 weights about 1 and votes about 100
 AT_EDGE = 0.1       # [voxels] mean distance of the mesh's border from the true edge, with `carve`...
 RIM = 0.1  # of the area: cells half outside of the only image have no vote
-NEAR_EDGE = 0.25    # ...and of 95 % of it: a cell is 0.25 voxels
+NEAR_EDGE = 0.5     # ...and of 95 % of it: two cells
 BEYOND_EDGE = 0.6   # [voxels] without it, the surface goes on to where voxels end: the same 95 %
 AREA = 1e-4         # relative: cuts go through vertices that are this near, in edges
 
