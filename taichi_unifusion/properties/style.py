@@ -15,12 +15,12 @@ from .base import Look, SurfaceProperty, color_of
 from .networks import ImageNetwork, check_preparation, prepare
 
 LOOK = Look()
-CONTOUR_WIDTH = 1.0  # [pixels]
+CONTOUR_WIDTH = 2.0  # [pixels]
 FAINTEST = 0.017     # change of brightness a pixel from which there is a contour
 OVERSHOOT = 10.0  # times the stated range that an output may reach before the range must be wrong
 
 
-def painting_style(*, smoothness: float = 60.0, detail: float = 0.45, contours: float = 6.0) -> SurfaceProperty:
+def painting_style(*, smoothness: float = 60.0, detail: float = 0.45, contours: float = 4.0) -> SurfaceProperty:
     """Flat regions within dark contours, by OpenCV's edge-preserving filter; no weights.
 
     `smoothness` in pixels, `detail` in 0..1, `contours` 0 for none. Every pixel depends on its surroundings only, not on the
