@@ -99,7 +99,7 @@ def test_no_map_changes_where_one_of_them_is_full(monkeypatch):
 
 @pytest.mark.parametrize("parts", [2, 5])
 def test_values_are_summed_in_cells_to_the_bit_as_one_array_is(parts):
-    """bin_together is bin_points on the arrays side by side, whose twin is in reference.py."""
+    """Several arrays are one array side by side, whose twin is in reference.py."""
     cloud = rough(6, count=3000)
     grid = PropertyMap("rgb", 3, voxel_size=0.05)._grid
     values = [cloud.attributes["rgb"], *[cloud.attributes["one"] * n for n in range(1, parts)]]
@@ -107,10 +107,7 @@ def test_values_are_summed_in_cells_to_the_bit_as_one_array_is(parts):
     for together in (False, True):
         blocks = FrameBlocks(grid, 2 + parts, with_positions=False)
         blocks.touch(cloud.points, 0.05)
-        if together:
-            blocks.bin_together(cloud.points, values, 0.05)
-        else:
-            blocks.bin(cloud.points, np.hstack(values), 0.05)
+        blocks.bin(cloud.points, values if together else [np.hstack(values)], 0.05)
         order = np.lexsort(blocks.keys.to_numpy()[:blocks.count].T)  # blocks are numbered as threads come
         sums.append([array.to_numpy()[:blocks.count][order] for array in (blocks.counts, blocks.sums)])
     assert sums[0][0].sum() == len(cloud)

@@ -85,7 +85,7 @@ def test_block_of_points_equals_its_twin(grid, cloud):
 def test_bin_points_equals_its_twin(grid, cloud):
     blocks = FrameBlocks(grid, 3, with_positions=True)
     blocks.touch(cloud.points, VS)
-    blocks.bin(cloud.points, cloud.normals, VS)
+    blocks.bin(cloud.points, [cloud.normals], VS)
     binned, twin = by_cell(blocks, keys_of(blocks)), reference.bin_points(in_voxels(cloud.points), cloud.normals.astype(float))
     assert binned.keys() == twin.keys() and max(count for count, _, _ in twin.values()) > 3
     for cell, (count, normal, position) in twin.items():
@@ -99,7 +99,7 @@ def test_the_order_of_points_does_not_change_the_sums(grid, cloud):
     for points, normals in ((cloud.points, cloud.normals), (cloud.points[order], cloud.normals[order])):
         blocks = FrameBlocks(grid, 3, with_positions=True)
         blocks.touch(points, VS)
-        blocks.bin(points, normals, VS)
+        blocks.bin(points, [normals], VS)
         sums.append(by_cell(blocks, keys_of(blocks)))
     assert sums[0].keys() == sums[1].keys()
     for cell, (count, mean) in sums[0].items():
@@ -110,7 +110,7 @@ def test_the_order_of_points_does_not_change_the_sums(grid, cloud):
 def test_surfel_kernels_equal_their_twins(grid, cloud):
     surfels, samples = FrameBlocks(grid, 3, with_positions=True), FrameBlocks(grid, 4, with_positions=False)
     surfels.touch(cloud.points, VS)
-    surfels.bin(cloud.points, cloud.normals, VS)
+    surfels.bin(cloud.points, [cloud.normals], VS)
     assert surfels.touch_samples(OFFSETS)
     samples.bin_samples(surfels, OFFSETS)
     x, normals = in_voxels(cloud.points), cloud.normals.astype(float)
@@ -130,7 +130,7 @@ def test_normals_that_cancel_give_no_samples(grid):
     normals = np.array([[0, 0, 1], [0, 0, -1]], np.float32)
     surfels, samples = FrameBlocks(grid, 3, with_positions=True), FrameBlocks(grid, 4, with_positions=False)
     surfels.touch(points, VS)
-    surfels.bin(points, normals, VS)
+    surfels.bin(points, [normals], VS)
     assert surfels.touch_samples(OFFSETS)
     samples.bin_samples(surfels, OFFSETS)
     assert not samples.counts.to_numpy().any() and not surfels.counts.to_numpy().any()
@@ -139,7 +139,7 @@ def test_normals_that_cancel_give_no_samples(grid):
 def test_mark_and_compact_cells_equal_their_twins(grid, cloud):
     blocks = FrameBlocks(grid, 3, with_positions=False)
     blocks.touch(cloud.points, VS)
-    blocks.bin(cloud.points, cloud.normals, VS)
+    blocks.bin(cloud.points, [cloud.normals], VS)
     keys, counts = keys_of(blocks), blocks.counts.to_numpy()[:blocks.count]
     rows = reference.compact_cells(counts, blocks.sums.to_numpy()[:blocks.count] / cell_kernels.FIXED)
     lattice = {cell: value[0] for cell, value in by_cell(blocks, keys).items()}
@@ -159,7 +159,7 @@ def test_a_frame_of_more_voxels_than_expected_is_given_room(grid):
     before = blocks.capacity
     blocks.touch(scattered, VS)
     assert blocks.count > before and set(keys_of(blocks)) == reference.touch_points(in_voxels(scattered))
-    blocks.bin(scattered, scattered, VS)
+    blocks.bin(scattered, [scattered], VS)
     assert blocks.counts.to_numpy().sum() == len(scattered)
 
 

@@ -36,18 +36,18 @@ def cell_center(cell: ti.i32):
 def bin_points(
     # in:
     points: Floats2,   # (N, 3) world [m]
-    values: Floats2,   # (N, c)
+    values_0: Floats2, values_1: Floats2, values_2: Floats2, values_3: Floats2,  # (N, c_i); any where c_i is 0
+    channels: ti.template(),  # c_i of the four
     per_meter: ti.f32,
     chunk: ti.i32,
-    channels: ti.template(),
     with_positions: ti.template(),
     block: ti.template(),
     # out:
     counts: Ints2,     # (B, 64) += points in the cell
-    sums: Sums3,       # (B, 64, c [+ 3]) += values, then position from the cell centre [voxels]
+    sums: Sums3,       # (B, 64, sum of c_i [+ 3]) += values side by side, then position from the cell centre [voxels]
 ):
     for part in range((points.shape[0] + chunk - 1) // chunk):
-        width = ti.static(channels + (3 if with_positions else 0))
+        width = ti.static(sum(channels) + (3 if with_positions else 0))
         place = ti.Vector([INDEX_HALF * CELLS, 0, 0])  # of the cell in the lattice of all cells
         b, run = -1, 0
         total = ti.Vector([0.0] * max(width, 1))  # in floats over a run: one thread adds it, always in the same order
@@ -63,52 +63,12 @@ def bin_points(
                 run = 0
                 total.fill(0.0)
             run += 1
-            for c in ti.static(range(channels)):
-                total[c] += values[n, c]
+            for i, values in ti.static(enumerate((values_0, values_1, values_2, values_3))):
+                for c in ti.static(range(channels[i])):
+                    total[ti.static(sum(channels[:i])) + c] += values[n, c]
             if ti.static(with_positions):
                 for d in ti.static(range(3)):
-                    total[channels + d] += (x[d] - at[d] - 0.5) / CELLS
-        if run > 0:
-            add_run(width, b, place, run, total, counts, sums)
-
-
-@ti.kernel
-def bin_together(
-    # in:
-    points: Floats2,   # (N, 3) world [m]
-    values_0: Floats2, values_1: Floats2, values_2: Floats2, values_3: Floats2,  # (N, c_i); (1, 1) where c_i is 0
-    channels: ti.template(),  # c_i of the four
-    per_meter: ti.f32,
-    chunk: ti.i32,
-    block: ti.template(),
-    # out:
-    counts: Ints2,     # (B, 64) += points in the cell
-    sums: Sums3,       # (B, 64, sum of c_i) += values side by side, as `bin_points` sums one array
-):
-    for part in range((points.shape[0] + chunk - 1) // chunk):
-        width = ti.static(sum(channels))
-        place = ti.Vector([INDEX_HALF * CELLS, 0, 0])  # of the cell in the lattice of all cells
-        b, run = -1, 0
-        total = ti.Vector([0.0] * width)
-        for n in range(part * chunk, ti.min((part + 1) * chunk, points.shape[0])):
-            at = ti.floor(row3(points, n) * (per_meter * CELLS), ti.i32)
-            if any(at != place):
-                if run > 0:
-                    add_run(width, b, place, run, total, counts, sums)
-                if any((at >> 2) != (place >> 2)):
-                    b = block[(at >> 2) + INDEX_HALF]
-                place = at
-                run = 0
-                total.fill(0.0)
-            run += 1
-            for c in ti.static(range(channels[0])):
-                total[c] += values_0[n, c]
-            for c in ti.static(range(channels[1])):
-                total[channels[0] + c] += values_1[n, c]
-            for c in ti.static(range(channels[2])):
-                total[channels[0] + channels[1] + c] += values_2[n, c]
-            for c in ti.static(range(channels[3])):
-                total[channels[0] + channels[1] + channels[2] + c] += values_3[n, c]
+                    total[width - 3 + d] += (x[d] - at[d] - 0.5) / CELLS
         if run > 0:
             add_run(width, b, place, run, total, counts, sums)
 

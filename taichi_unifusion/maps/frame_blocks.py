@@ -61,19 +61,14 @@ class FrameBlocks:
                 return
             self._allocate(self.count * 5 // 4)
 
-    def bin(self, points: NDArray[np.float32], values: NDArray[np.float32], voxel_size: float) -> None:
-        """Sum points, values and positions into the cells of the touched blocks."""
-        kernels.bin_points(points, values, 1.0 / voxel_size, self.chunk, self.channels, self.with_positions, self.grid.block,
-                           self.counts, self.sums)
-
-    def bin_together(self, points: NDArray[np.float32], values: Sequence[NDArray[np.float32]], voxel_size: float) -> None:
-        """Sum several arrays of values, side by side, as `bin` sums one; every point's cell is found once."""
+    def bin(self, points: NDArray[np.float32], values: Sequence[NDArray[np.float32]], voxel_size: float) -> None:
+        """Sum arrays of values (N, c), side by side, and positions into the cells of the touched blocks."""
         if len(values) > TOGETHER:
             values = [*values[:TOGETHER - 1], np.hstack(values[TOGETHER - 1:])]
-        nothing = [np.zeros((1, 1), np.float32)] * (TOGETHER - len(values))
-        channels = tuple(array.shape[1] for array in values) + (0,) * len(nothing)
-        kernels.bin_together(points, *values, *nothing, channels, 1.0 / voxel_size, self.chunk, self.grid.block, self.counts,
-                             self.sums)
+        nothing = TOGETHER - len(values)
+        channels = tuple(array.shape[1] for array in values) + (0,) * nothing
+        kernels.bin_points(points, *values, *[points] * nothing, channels, 1.0 / voxel_size, self.chunk, self.with_positions,
+                           self.grid.block, self.counts, self.sums)
 
     def touch_samples(self, offsets: NDArray[np.float32]) -> bool:
         """Also give numbers to the voxels of the samples beside the surfels; False where room had to be made: begin again."""
@@ -108,5 +103,6 @@ class FrameBlocks:
 
     def bin_support(self, points: NDArray[np.float32], voxel_size: float, support_points: int) -> None:
         """Only the support masks, from points in touched blocks."""
-        kernels.bin_points(points, points, 1.0 / voxel_size, self.chunk, 0, False, self.grid.block, self.counts, self.sums)
+        kernels.bin_points(*[points] * (1 + TOGETHER), (0,) * TOGETHER, 1.0 / voxel_size, self.chunk, False, self.grid.block,
+                           self.counts, self.sums)
         self.compact(support_points)

@@ -66,10 +66,7 @@ class PropertyMap(BaseMap):
             blocks.bin_support(points, self.voxel_size, 1)
             return
         blocks.touch(points, self.voxel_size)
-        if len(values) == 1:
-            blocks.bin(points, values[0], self.voxel_size)
-        else:
-            blocks.bin_together(points, values, self.voxel_size)
+        blocks.bin(points, values, self.voxel_size)
         blocks.compact(1)
         regressor.encode_cells(blocks)
 

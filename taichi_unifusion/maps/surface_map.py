@@ -56,7 +56,7 @@ class SurfaceMap(BaseMap):
         """
         while True:
             self._surfels.touch(cloud.points, self.voxel_size)
-            self._surfels.bin(cloud.points, cloud.normals, self.voxel_size)
+            self._surfels.bin(cloud.points, [cloud.normals], self.voxel_size)
             if self._surfels.touch_samples(self._steps):
                 break
         self._samples.bin_samples(self._surfels, self._steps)
