@@ -80,8 +80,16 @@ def _describe_run(file: Path) -> str:
         metrics = json.loads(read_bytes(file))
         frames, versions = metrics["frames"], metrics["versions"]
         return "\n".join([
+            *([_describe_recording(metrics["recording"])] if "recording" in metrics else []),
             f"frames  {frames['used']} used, {frames['skipped']} skipped{', stopped early' if frames['interrupted'] else ''}",
             f"made    by taichi_unifusion {versions['taichi_unifusion']} on {metrics['device_name']}, "
             f"{metrics['milliseconds']['frame']['median']:.0f} ms a frame (median)"])
     except (ValueError, KeyError, TypeError) as error:
         raise FileError(f"{file}: not the metrics of a run, or a damaged file ({error})") from None
+
+
+def _describe_recording(recording: dict[str, object]) -> str:
+    source = f"{recording['format']} {recording['path']}".rstrip()
+    last = "the last" if recording["end"] is None else int(recording["end"]) - 1
+    steps = f" in steps of {recording['every']}" if recording["every"] != 1 else ""
+    return f"from    {source}, frames {recording['start']} to {last}{steps}"

@@ -369,11 +369,12 @@ def test_mesh_extracts_again_finer(made, tmp_path, capsys):
     assert (copy / "mesh.glb").exists()
 
 
-def test_info_describes_a_folder_a_map_and_a_mesh(made, capsys):
+def test_info_describes_a_folder_a_map_and_a_mesh(made, recording, capsys):
     voxels = {name: f"{len(read_map(made / 'maps' / f'{name}.safetensors')[0]['keys']):,}" for name in ("surface", "color")}
     assert cli.main(["info", str(made)]) == 0
     text = capsys.readouterr().out
-    for part in (*voxels.values(), "10 cm", "5 cm", "rank 20 of 256", "triangles", "normals, color", "3 used, 0 skipped"):
+    for part in (*voxels.values(), "10 cm", "5 cm", "rank 20 of 256", "triangles", "normals, color", "3 used, 0 skipped",
+                 f"folder {recording}, frames 0 to the last"):
         assert part in text
     assert cli.main(["info", str(made / "maps" / "color.safetensors")]) == 0
     assert voxels["color"] in capsys.readouterr().out
