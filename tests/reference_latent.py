@@ -72,28 +72,29 @@ def query_products(encoder, solved, x):
     return values, valid
 
 
-def fuse_rows(a, weight_a, b, weight_b):
-    """Eq. 19."""
-    return (a * weight_a + b * weight_b) / (weight_a + weight_b)
+def fuse_voxels(mean_f_a, mean_a, slopes_a, weight_a, mean_f_b, mean_b, slopes_b, weight_b):
+    """Mean and slopes (covariances with f) of what two voxels saw together, from the plain sums of products (Eq. 19)."""
+    total = weight_a + weight_b
+    mean_f, mean = ((a * weight_a + b * weight_b) / total for a, b in ((mean_f_a, mean_f_b), (mean_a, mean_b)))
+    products = ((slopes_a + np.outer(mean_f_a, mean_a)) * weight_a + (slopes_b + np.outer(mean_f_b, mean_b)) * weight_b) / total
+    return mean, products - np.outer(mean_f, mean)
 
 
-def project_rows(rows, directions):
-    """Products (S, r, T)."""
-    return np.einsum("src,tc->srt", rows.astype(float), directions)
+def decoded_rows(means, slopes, scales):
+    """Mean and slopes (S, 1 + q, c) as numbers."""
+    return np.concatenate([means[:, None].astype(float), slopes.reshape(*scales.shape, -1) * scales[..., None].astype(float)], 1)
 
 
-def take_channels(rows, first, count):
-    """(S, r, count)."""
-    return rows[:, :, first:first + count].astype(float)
+def project_rows(means, slopes, scales, directions):
+    """Products (S, 1 + q, T)."""
+    return np.einsum("src,tc->srt", decoded_rows(means, slopes, scales), directions)
 
 
-def mean_lengths(rows):
-    """Length (S,) of the first row."""
-    return np.linalg.norm(rows[:, 0].astype(float), axis=1)
+def take_channels(means, slopes, scales, first, count):
+    """(S, 1 + q, count)."""
+    return decoded_rows(means, slopes, scales)[:, :, first:first + count]
 
 
-def copy_rows(rows, slots):
-    """Rows of slots, in order."""
-    return rows[slots]
-
-
+def mean_lengths(means):
+    """Length (S,) of the means."""
+    return np.linalg.norm(means.astype(float), axis=1)

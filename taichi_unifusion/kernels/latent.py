@@ -1,12 +1,16 @@
 """High-dimensional features of the surface: regressed and fused as sums, solved only when they are asked for (Sec. IV-D).
 
-A voxel keeps running means over all that was seen in its doubled voxel: of the features y (its *mean* row), of f y^T (a row
-for each of q position features f), of f and of f f^T (its *moments*). Eq. 19 fuses means exactly, so that
+A voxel keeps running means over all that was seen in its doubled voxel: of the features y (its *mean*), of f and of f f^T for q
+position features f (its *moments*), and the covariances of f and y (its *slopes*, q rows). Eq. 19 fuses all of these exactly, the
+slopes with what the means moved, so that
 
-    F = (E[f f^T] - E[f] E[f]^T + d / w I)^-1 (E[f y^T] - E[f] E[y]^T)
+    F = (E[f f^T] - E[f] E[f]^T + d / w I)^-1 cov(f, y)
 
 is the regression (Eq. 6) over all frames at once, about the mean of what was seen. Everything is linear in y: a text is
 multiplied onto the rows first, and the regression is then solved for one number instead of c.
+
+Slopes may be kept in 8 bits with a scale for each row. They are then rounded up or down by chance, so that no frame's share is
+lost to rounding on average; the chance is a hash of the voxel and its weight, so that the same frames give the same map.
 """
 
 import taichi as ti
@@ -17,7 +21,8 @@ from .voxels import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, row3
 
 ENTRIES = 528    # cells of a doubled voxel, 512 at most; no power of two, whose rows would share cache lines
 CHANNELS = 16    # channels that a worker sums at once
-Halves3 = ti.types.ndarray(dtype=ti.f16, ndim=3)
+LEVELS = 127     # of the largest number of a row in 8 bits
+Rows2 = ti.types.ndarray(ndim=2)  # of any precision
 Bytes1 = ti.types.ndarray(dtype=ti.u8, ndim=1)
 
 
@@ -106,18 +111,24 @@ def gather_entries(
 @ti.func
 def fuse_moments(rank: ti.template(), s: ti.i32, worker: ti.i32, filled: ti.i32, factors: ti.template(),
                  moments: ti.template(), weights: ti.template()):
-    """Fuse E[f] and the lower triangle of E[f f^T] of a voxel; returns its new weight and the share of it that is new."""
+    """Fuse E[f] and the lower triangle of E[f f^T] of a voxel.
+
+    Returns the weight that is new, its share of all, E[f] of what is new, and how far that is from what was there.
+    """
     weight = 0.0
     for k in range(filled):
         weight += factors[worker, 0, k]
     old = weights[s]
     share = weight / (old + weight) if old > 0 else 1.0
+    means, moved = ti.Vector([0.0] * rank), ti.Vector([0.0] * rank)
     at = 0
     for a in range(rank):
         mean = 0.0
         for k in range(filled):
             mean += factors[worker, 1 + a, k]
-        moments[s, a, 0] = moments[s, a, 0] + (mean / weight - moments[s, a, 0]) * share
+        means[a] = mean / weight
+        moved[a] = means[a] - moments[s, a, 0]
+        moments[s, a, 0] = moments[s, a, 0] + moved[a] * share
         for b in range(a + 1):
             product = 0.0
             for k in range(filled):
@@ -126,14 +137,70 @@ def fuse_moments(rank: ti.template(), s: ti.i32, worker: ti.i32, filled: ti.i32,
             moments[s, place, 0] = moments[s, place, 0] + (product / weight - moments[s, place, 0]) * share
             at += 1
     weights[s] = old + weight
-    return weight, share
+    return weight, share, means, moved
+
+
+@ti.func
+def chance(seed: ti.u32, i: ti.i32) -> ti.f32:
+    """A number in [0, 1) for the i-th number of a voxel."""
+    h = (seed + ti.cast(i, ti.u32)) * ti.u32(0x9E3779B1)
+    h = (h ^ (h >> 15)) * ti.u32(0x85EBCA77)
+    h = h ^ (h >> 13)
+    return ti.cast(h >> 8, ti.f32) * (1.0 / (1 << 24))
+
+
+@ti.func
+def fuse_row(
+    # in:
+    rank: ti.template(), bits8: ti.template(), s: ti.i32, worker: ti.i32, channels: ti.i32, share: ti.f32, moved: ti.template(),
+    seed: ti.u32,
+    # in and out:
+    fresh: ti.template(),  # scratch of each worker: mean and slopes of what is new
+    # out:
+    means: ti.template(), slopes: ti.template(), scales: ti.template(),
+):
+    """Fuse new features into those of voxel s: the mean, and the slopes about it, in the precision that they are kept in."""
+    for c in range(channels):
+        before = ti.cast(means[s, c], ti.f32)
+        fresh[worker, 0, c] -= before
+        means[s, c] = before + fresh[worker, 0, c] * share
+    for a in range(rank):
+        largest, scale, apart = 0.0, scales[s, a], share * (1.0 - share) * moved[a]
+        for c in range(channels):
+            before = ti.cast(slopes[s, a * channels + c], ti.f32) * scale
+            value = before + (fresh[worker, 1 + a, c] - before) * share + apart * fresh[worker, 0, c]
+            fresh[worker, 1 + a, c] = value
+            largest = ti.max(largest, ti.abs(value))
+        if ti.static(bits8):
+            scale = largest / LEVELS
+            per = 1.0 / scale if largest > 1e-30 else 0.0
+            for c in range(channels):
+                i = a * channels + c
+                slopes[s, i] = ti.cast(ti.floor(fresh[worker, 1 + a, c] * per + chance(seed, i)), ti.i8)
+            scales[s, a] = scale
+        else:
+            for c in range(channels):
+                slopes[s, a * channels + c] = fresh[worker, 1 + a, c]
+            scales[s, a] = 1.0
+
+
+@ti.func
+def voxel_seed(ijk: ti.template(), weight: ti.f32) -> ti.u32:
+    """What the rounding of a voxel begins with: another for every voxel, and for every weight that it had."""
+    h = ti.bit_cast(weight, ti.u32)
+    for d in ti.static(range(3)):
+        h = (h ^ ti.cast(ijk[d], ti.u32)) * ti.u32(0x01000193)
+        h ^= h >> 16
+    return h
 
 
 @ti.kernel
 def fuse_features(
     # in:
     rank: ti.template(),   # q
+    bits8: ti.template(),  # whether slopes are kept in 8 bits
     blocks: ti.i32,
+    keys: Ints2,           # (B, 3)
     slots: Ints1,          # (B,) slot in the map, -1 where the block is left out
     neighbors: Ints2,      # (B, 27)
     masks: Masks2, window: Masks2, starts: Ints1, cells: Floats2,  # as find_pixels; (27, 2) cells of each neighbour that count
@@ -143,8 +210,10 @@ def fuse_features(
     scale: ti.f32,         # weight of a point: feature pixels a point
     workers: ti.i32, stride: ti.i32,
     # out:
-    factors: ti.template(), places: ti.template(), tiles: ti.template(),  # scratch of each worker
-    rows: Halves3,         # (S, 1 + q, c) E[y], E[f y^T]
+    factors: ti.template(), places: ti.template(), tiles: ti.template(), fresh: ti.template(),  # scratch of each worker
+    means: Rows2,          # (S, c) E[y]
+    slopes: Rows2,         # (S, q c) cov(f, y), by the voxel's scales
+    scales: Floats2,       # (S, q)
     moments: Floats3,      # (S, q + q (q + 1) / 2, 1) E[f], E[f f^T]
     weights: Floats1,      # (S,) feature pixels seen in the doubled voxel
 ):
@@ -156,55 +225,55 @@ def fuse_features(
                 if s >= 0:
                     filled = gather_entries(rank, v, worker, neighbors, masks, window, starts, cells, pixels, features, scale,
                                             factors, places)
-                    weight, share = fuse_moments(rank, s, worker, filled, factors, moments, weights)
+                    weight, share, mean_f, moved = fuse_moments(rank, s, worker, filled, factors, moments, weights)
                     length = (filled + 15) // 16 * 16
                     for part in range(image.shape[1] // CHANNELS):
                         for k in range(length):  # transposed, so that the sums below run over the contiguous axis
                             for c in ti.static(range(CHANNELS)):
                                 tiles[worker, c, k] = image[places[worker, k], part * CHANNELS + c]
-                        for c in range(ti.min(CHANNELS, rows.shape[2] - part * CHANNELS)):
+                        for c in range(CHANNELS):
                             sums = ti.Vector([0.0] * (1 + rank))
                             for k in range(length):
                                 y = tiles[worker, c, k]
                                 for a in ti.static(range(1 + rank)):
                                     sums[a] += factors[worker, a, k] * y
-                            channel = part * CHANNELS + c
-                            for a in ti.static(range(1 + rank)):
-                                before = ti.cast(rows[s, a, channel], ti.f32)
-                                after = before + (sums[a] / weight - before) * share
-                                rows[s, a, channel] = ti.cast(after, ti.f16)
+                            mean = sums[0] / weight
+                            fresh[worker, 0, part * CHANNELS + c] = mean
+                            for a in ti.static(range(rank)):
+                                fresh[worker, 1 + a, part * CHANNELS + c] = sums[1 + a] / weight - mean_f[a] * mean
+                    fuse_row(rank, bits8, s, worker, means.shape[1], share, moved, voxel_seed(row3(keys, v), weights[s]), fresh,
+                             means, slopes, scales)
 
 
 @ti.kernel
-def fuse_rows(
+def fuse_voxels(
     # in:
+    rank: ti.template(), bits8: ti.template(),
     voxels: ti.i32,
-    slots: Ints1,          # (N,)
-    rows: Halves3,         # (N, r, c)
-    weights: Floats1,      # (N,)
-    map_weights: Floats1,  # (S,) before these are added
+    keys: Ints2,              # (N, 3)
+    slots: Ints1,             # (N,) slot in the map
+    other_means: Rows2, other_slopes: Rows2, other_scales: Floats2, other_moments: Floats3, other_weights: Floats1,  # (N, ...)
+    workers: ti.i32, stride: ti.i32,
     # out:
-    map_rows: Halves3,     # (S, r, c)
+    fresh: ti.template(),     # scratch of each worker
+    means: Rows2, slopes: Rows2, scales: Floats2, moments: Floats3, weights: Floats1,  # as fuse_features
 ):
-    for n in range(voxels):
-        s = slots[n]
-        old = map_weights[s]
-        share = weights[n] / (old + weights[n]) if old > 0 else 1.0
-        for a in range(rows.shape[1]):
-            for c in range(rows.shape[2]):
-                before = ti.cast(map_rows[s, a, c], ti.f32)
-                map_rows[s, a, c] = ti.cast(before + (ti.cast(rows[n, a, c], ti.f32) - before) * share, ti.f16)
-
-
-@ti.kernel
-def copy_rows(
-    # in:
-    slots: Ints1,   # (N,) rows of the source to take, in order
-    source: Halves3,
-    # out:
-    target: Halves3,  # (>= N, r, c)
-):
-    for n in range(slots.shape[0]):
-        for a in range(source.shape[1]):
-            for c in range(source.shape[2]):
-                target[n, a, c] = source[slots[n], a, c]
+    for i in range(workers * stride):
+        if i % stride == 0:
+            worker = i // stride
+            for n in range(worker * voxels // workers, (worker + 1) * voxels // workers):
+                s, channels = slots[n], means.shape[1]
+                share = other_weights[n] / (weights[s] + other_weights[n]) if weights[s] > 0 else 1.0
+                moved = ti.Vector([0.0] * rank)
+                for a in range(rank):
+                    moved[a] = other_moments[n, a, 0] - moments[s, a, 0]
+                for a in range(moments.shape[1]):
+                    moments[s, a, 0] = moments[s, a, 0] + (other_moments[n, a, 0] - moments[s, a, 0]) * share
+                weights[s] = weights[s] + other_weights[n]
+                for c in range(channels):
+                    fresh[worker, 0, c] = ti.cast(other_means[n, c], ti.f32)
+                for a in range(rank):
+                    for c in range(channels):
+                        fresh[worker, 1 + a, c] = ti.cast(other_slopes[n, a * channels + c], ti.f32) * other_scales[n, a]
+                fuse_row(rank, bits8, s, worker, channels, share, moved, voxel_seed(row3(keys, n), weights[s]), fresh,
+                         means, slopes, scales)

@@ -5,60 +5,70 @@ See `latent.py` for what a voxel keeps.
 
 import taichi as ti
 
-from .latent import Bytes1, Halves3
+from .latent import Bytes1, Rows2
 from .query import nearest_voxel
 from .voxels import INDEX_HALF, Floats1, Floats2, Floats3, all_within, row3, voxel_of
 
-DIRECTIONS = 4   # texts that a row is multiplied with at once
+DIRECTIONS = 4   # texts that are worked on at once
 
 
 @ti.kernel
 def project_rows(
     # in:
     voxels: ti.i32,
-    rows: Halves3,        # (S, r, c)
+    means: Rows2, slopes: Rows2, scales: Floats2,  # (S, c), (S, q c), (S, q)
     directions: Floats2,  # (T, c), T a multiple of DIRECTIONS
     # out:
-    products: Floats3,    # (S, r, T)
+    products: Floats3,    # (S, 1 + q, T)
 ):
     for s in range(voxels):
-        for a in range(rows.shape[1]):
-            for part in range(directions.shape[0] // DIRECTIONS):
+        channels = means.shape[1]
+        for part in range(directions.shape[0] // DIRECTIONS):
+            sums = ti.Vector([0.0] * DIRECTIONS)
+            for c in range(channels):
+                y = ti.cast(means[s, c], ti.f32)
+                for t in ti.static(range(DIRECTIONS)):
+                    sums[t] += y * directions[part * DIRECTIONS + t, c]
+            for t in ti.static(range(DIRECTIONS)):
+                products[s, 0, part * DIRECTIONS + t] = sums[t]
+            for a in range(scales.shape[1]):
                 sums = ti.Vector([0.0] * DIRECTIONS)
-                for c in range(rows.shape[2]):
-                    y = ti.cast(rows[s, a, c], ti.f32)
+                for c in range(channels):
+                    y = ti.cast(slopes[s, a * channels + c], ti.f32)
                     for t in ti.static(range(DIRECTIONS)):
                         sums[t] += y * directions[part * DIRECTIONS + t, c]
                 for t in ti.static(range(DIRECTIONS)):
-                    products[s, a, part * DIRECTIONS + t] = sums[t]
+                    products[s, 1 + a, part * DIRECTIONS + t] = sums[t] * scales[s, a]
 
 
 @ti.kernel
 def take_channels(
     # in:
     voxels: ti.i32,
-    rows: Halves3,      # (S, r, c)
+    means: Rows2, slopes: Rows2, scales: Floats2,  # (S, c), (S, q c), (S, q)
     first: ti.i32,
     # out:
-    products: Floats3,  # (S, r, T) channels first .. first + T
+    products: Floats3,  # (S, 1 + q, T) channels first .. first + T, as far as there are so many
 ):
-    for s, a in ti.ndrange(voxels, rows.shape[1]):
-        for t in range(products.shape[2]):
-            products[s, a, t] = ti.cast(rows[s, a, first + t], ti.f32)
+    for s in range(voxels):
+        for t in range(ti.min(products.shape[2], means.shape[1] - first)):
+            products[s, 0, t] = ti.cast(means[s, first + t], ti.f32)
+            for a in range(scales.shape[1]):
+                products[s, 1 + a, t] = ti.cast(slopes[s, a * means.shape[1] + first + t], ti.f32) * scales[s, a]
 
 
 @ti.kernel
 def mean_lengths(
     # in:
     voxels: ti.i32,
-    rows: Halves3,     # (S, r, c)
+    means: Rows2,      # (S, c)
     # out:
     lengths: Floats1,  # (S,) |E[y]|
 ):
     for s in range(voxels):
         total = 0.0
-        for c in range(rows.shape[2]):
-            y = ti.cast(rows[s, 0, c], ti.f32)
+        for c in range(means.shape[1]):
+            y = ti.cast(means[s, c], ti.f32)
             total += y * y
         lengths[s] = ti.sqrt(total)
 
@@ -72,7 +82,7 @@ def solve_rows(
     weights: Floats1,   # (S,)
     noise: ti.f32,      # d of Eq. 6 for one feature pixel
     # in and out:
-    products: Floats3,  # (S, 1 + q, T) products of the rows -> the constant and the coefficients of f_posi
+    products: Floats3,  # (S, 1 + q, T) products of mean and slopes -> the constant and the coefficients of f_posi
 ):
     for s in range(voxels):
         L = ti.Vector([0.0] * (rank * rank))
@@ -91,7 +101,7 @@ def solve_rows(
             F = ti.Vector([0.0] * rank)
             mean = products[s, 0, t]
             for a in range(rank):
-                value = products[s, 1 + a, t] - moments[s, a, 0] * mean
+                value = products[s, 1 + a, t]
                 for k in range(a):
                     value -= L[a * rank + k] * F[k]
                 F[a] = value * L[a * rank + a]
@@ -132,7 +142,7 @@ def query_products(
     points: Floats2,     # (N, 3) world [m]
     per_meter: ti.f32,
     slot: ti.template(),
-    products: Floats3,   # (S, 1 + q, T) constants and coefficients
+    products: Floats3,   # (S, 1 + q, T) constants and coefficients, T a multiple of DIRECTIONS
     table: Floats2,      # (nodes^3, q)
     nodes: ti.i32,
     reach: ti.i32,       # points that no voxel covers take the value of the nearest one within so many voxels
@@ -169,9 +179,11 @@ def query_products(
                     weight += tent
                     covered += ti.cast(o < 8, ti.i32)
         valid[n] = ti.cast(covered > 0, ti.u8)
-        for t in range(values.shape[1]):
-            value = 0.0
+        for part in range(values.shape[1] // DIRECTIONS):
+            sums = ti.Vector([0.0] * DIRECTIONS)
             for i in range(found):
-                for a in ti.static(range(1 + rank)):
-                    value += shares[i * (1 + rank) + a] * products[slots[i], a, t]
-            values[n, t] = value / ti.max(weight, 1e-12)
+                for a in range(1 + rank):
+                    for t in ti.static(range(DIRECTIONS)):
+                        sums[t] += shares[i * (1 + rank) + a] * products[slots[i], a, part * DIRECTIONS + t]
+            for t in ti.static(range(DIRECTIONS)):
+                values[n, part * DIRECTIONS + t] = sums[t] / ti.max(weight, 1e-12)

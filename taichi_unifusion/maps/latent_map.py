@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..encoding import position_encoding
-from ..errors import CapacityError, FrameError, InputError, MapCorrupt
+from ..errors import FrameError, InputError
 from ..kernels import fusion, regression
 from ..kernels import latent as kernels
 from ..kernels import latent_query as decoding
 from ..kernels.voxels import CELLS
 from ..types import FeatureImage, PointCloud
 from .base_map import BaseMap, Integration
+from .feature_rows import FeatureRows, RowData
 from .frame_blocks import FrameBlocks
 from .property_map import NEAREST_REACH
 from .regressor import CPU_STRIDE, CPU_WORKERS, GPU_STRIDE, _to_device, _window_masks
@@ -26,10 +27,9 @@ from .voxel_grid import VoxelData, VoxelGrid
 
 GPU_WORKERS = 1024
 NODES = 17                # of the table of position features along an edge of the doubled voxel
-MAX_ELEMENTS = 2**31 - 1  # of an array of Taichi
 MAX_FEATURE = 1e4         # above it half precision, which ends at 65,504, would lose sums
 TEXTS_AT_ONCE = 64
-CHANNELS_AT_ONCE = 16
+CHANNELS_AT_ONCE = 32
 
 
 class LatentMap(BaseMap):
@@ -40,7 +40,7 @@ class LatentMap(BaseMap):
         scores = features.similarity(mesh.vertices, texts)     # (V, n) cosines with texts (n, 512)
 
     A frame's features are never put on its points or pixels: a voxel takes sums over the few feature pixels that it sees.
-    Rows are kept in half precision, `encoder.rank` of them a voxel. Keywords are those of `LatentSettings`.
+    It keeps a mean and `encoder.rank` - 1 slopes, in the precision of the settings. Keywords are those of `LatentSettings`.
     """
 
     kind = "latent"
@@ -54,7 +54,7 @@ class LatentMap(BaseMap):
         self._rank = rank = settings.encoder.rank - 1  # the mean stands for the first eigenpair, which is nearly constant
         self._grid = VoxelGrid(rank + rank * (rank + 1) // 2, 1)  # the moments, and weights
         self._cells = FrameBlocks(self._grid, 0, with_positions=True)
-        self._rows = ti.ndarray(ti.f16, (1, 1 + rank, channels))
+        self._rows = FeatureRows(rank, channels, settings.precision)
         encoding = position_encoding(settings.encoder)
         self._cell_features = _to_device(encoding(encoding.nodes(2 * CELLS))[:, 1:])
         axis = np.linspace(-0.5, 0.5, NODES)
@@ -71,18 +71,21 @@ class LatentMap(BaseMap):
         return cls(name, channels, settings)
 
     def _shared_scratch(self) -> tuple:
-        """Scratch for the workers, one for all maps of a runtime: factors, places and feature tiles."""
-        scratch, key = self._grid.runtime.scratch, ("latent", self._workers, self._rank)
+        """Scratch for the workers, one for all maps of a runtime: factors, places, feature tiles, and what a frame adds."""
+        scratch = self._grid.runtime.scratch
+        room = _whole(self.channels, kernels.CHANNELS)
+        key = "latent", self._workers, self._rank, room
         if key not in scratch:
             scratch[key] = (ti.field(ti.f32, (self._workers, 1 + self._rank, kernels.ENTRIES)),
                             ti.field(ti.i32, (self._workers, kernels.ENTRIES)),
-                            ti.field(ti.f32, (self._workers, kernels.CHANNELS, kernels.ENTRIES)))
+                            ti.field(ti.f32, (self._workers, kernels.CHANNELS, kernels.ENTRIES)),
+                            ti.field(ti.f32, (self._workers, 1 + self._rank, room)))
         return scratch[key]
 
     @property
     def memory_bytes(self) -> int:
         """Bytes of the voxels and their index."""
-        return self._grid.memory_bytes + len(self) * (1 + self._rank) * self.channels * 2
+        return self._grid.memory_bytes + len(self) * self._rows.bytes_per_voxel
 
     def integrate(self, cloud: PointCloud) -> Integration:
         """Fuse the features that a cloud's points see into the map; the cloud in world coordinates.
@@ -103,17 +106,18 @@ class LatentMap(BaseMap):
             return Integration(len(cloud), 0, len(self))
         slots = np.empty(blocks.count, np.int32)
         encoded = self._grid.claim(blocks.count, blocks.keys, weights, slots)
-        self._reserve_rows()
+        self._rows.reserve(self._grid.capacity, len(self))
         if blocks.count > self._neighbors.shape[0]:
             self._neighbors = ti.ndarray(ti.i32, (blocks.count * 5 // 4, 27))
         regression.find_neighbors(self._grid.stamp, self._grid.block, blocks.frame, blocks.count, blocks.keys, self._neighbors)
-        kernels.fuse_features(self._rank, blocks.count, slots, self._neighbors, blocks.masks, self._window, blocks.starts,
-                              blocks.cells, pixels, self._cell_features, image, float((seen > 0).sum() / seen.sum()),
-                              self._workers, self._stride, *self._scratch, self._rows, self._grid.latents, self._grid.weights)
+        kernels.fuse_features(self._rank, self._rows.bits8, blocks.count, blocks.keys, slots, self._neighbors, blocks.masks,
+                              self._window, blocks.starts, blocks.cells, pixels, self._cell_features, image,
+                              float((seen > 0).sum() / seen.sum()), self._workers, self._stride, *self._scratch,
+                              *self._rows.pools, self._grid.latents, self._grid.weights)
         return Integration(len(cloud), encoded, len(self))
 
     def remove(self, cloud: PointCloud) -> Integration:
-        """Raises InputError: in half precision a frame cannot be taken out again without a trace."""
+        """Raises InputError: after rounding a frame cannot be taken out again without a trace."""
         raise InputError(f"latent map '{self.name}': frames cannot be taken out of a map of features; make it anew")
 
     def _features_of(self, cloud: PointCloud) -> FeatureImage:
@@ -133,8 +137,7 @@ class LatentMap(BaseMap):
         if not usable.any():
             raise FrameError(f"features '{self.name}': not one pixel is finite; the frame is left out")
         if not usable.all() or self.channels % kernels.CHANNELS:
-            room = -(-self.channels // kernels.CHANNELS) * kernels.CHANNELS
-            filled = np.zeros((len(rows), room), np.float32)
+            filled = np.zeros((len(rows), _whole(self.channels, kernels.CHANNELS)), np.float32)
             filled[usable, :self.channels] = rows[usable]
             rows = filled
         largest = max(float(rows.max()), -float(rows.min()))
@@ -152,18 +155,6 @@ class LatentMap(BaseMap):
         runtime.synchronize()
         return pixels, seen, weights
 
-    def _reserve_rows(self) -> None:
-        """Room in the rows for every slot of the grid."""
-        shape = (self._grid.capacity, 1 + self._rank, self.channels)
-        if self._rows.shape[0] == shape[0]:
-            return
-        if np.prod(shape) > MAX_ELEMENTS:
-            raise CapacityError(f"the map holds {len(self):,} voxels of {1 + self._rank} x {self.channels} numbers, as many as "
-                                "fit into an array: use larger voxels or save the map and start a new one")
-        old, self._rows = self._rows, ti.ndarray(ti.f16, shape)
-        kept = min(old.shape[0], len(self))
-        kernels.copy_rows(np.arange(kept, dtype=np.int32), old, self._rows)
-
     def similarity(self, points: NDArray, text_embedding: NDArray, return_valid: bool = False):
         """Cosine (N, n) between the features at points (N, 3) world [m] and text embeddings (n, c); (N,) for a single (c,).
 
@@ -178,15 +169,12 @@ class LatentMap(BaseMap):
         if not np.isfinite(texts).all() or not np.linalg.norm(texts, axis=1).all():
             raise InputError(f"latent map '{self.name}': a text embedding is zero or not finite")
         texts = texts / np.linalg.norm(texts, axis=1, keepdims=True)
-        scores, valid = [], None
+        scores, valid, lengths = [], None, self._mean_lengths()
         for first in range(0, len(texts), TEXTS_AT_ONCE):
             part = texts[first:first + TEXTS_AT_ONCE]
-            filled = np.zeros((-(-len(part) // decoding.DIRECTIONS) * decoding.DIRECTIONS, self.channels), np.float32)
+            filled = np.zeros((_whole(len(part), decoding.DIRECTIONS), self.channels), np.float32)
             filled[:len(part)] = part
-            products = self._solved(lambda out: decoding.project_rows(len(self), self._rows, filled, out), len(filled))
-            lengths = np.ones(len(self), np.float32)
-            if len(self):
-                decoding.mean_lengths(len(self), self._rows, lengths)
+            products = self._solved(lambda out: decoding.project_rows(len(self), *self._rows.pools, filled, out), len(part))
             values, valid = self._decode(points, products / np.maximum(lengths, 1e-12)[:, None, None])
             scores.append(values[:, :len(part)])
         values = np.concatenate(scores, axis=1)
@@ -199,14 +187,10 @@ class LatentMap(BaseMap):
         From how much of the length of unit features is left in their mean over w feature pixels: what agrees stays, white noise
         shrinks. Features that were not of unit length make it wrong.
         """
-        n = len(self)
-        lengths, weights = np.ones(n, np.float32), np.ones(n, np.float32)
-        if n:
-            decoding.mean_lengths(n, self._rows, lengths)
-            weights = self._grid.weights.to_numpy()[:n]
-        more = np.maximum(weights, 1 + 1e-3)
+        n, lengths = len(self), self._mean_lengths()
+        more = np.maximum(self._grid.weights.to_numpy()[:n], 1 + 1e-3)
         agreeing = np.clip((lengths**2 - 1 / more) / (1 - 1 / more), 1e-3, 1)
-        products = np.zeros((max(n, 1), 1 + self._rank, 1), np.float32)
+        products = np.zeros((max(n, 1), 1 + self._rank, decoding.DIRECTIONS), np.float32)
         products[:n, 0, 0] = np.sqrt((1 - agreeing) / (agreeing * self.channels * more))
         return self._decode(points, products)[0][:, 0]
 
@@ -215,14 +199,25 @@ class LatentMap(BaseMap):
         values, valid = np.zeros((len(points), self.channels), np.float32), np.zeros(len(points), bool)
         for first in range(0, self.channels, CHANNELS_AT_ONCE):
             count = min(CHANNELS_AT_ONCE, self.channels - first)
-            products = self._solved(lambda out: decoding.take_channels(len(self), self._rows, first, out), count)
-            values[:, first:first + count], valid = self._decode(points, products)
+            products = self._solved(lambda out: decoding.take_channels(len(self), *self._rows.pools, first, out), count)
+            part, valid = self._decode(points, products)
+            values[:, first:first + count] = part[:, :count]
         return (values, valid) if return_valid else values
 
+    def _mean_lengths(self) -> NDArray[np.float32]:
+        """Length (S,) of every voxel's mean."""
+        lengths = np.ones(len(self), np.float32)
+        if len(self):
+            decoding.mean_lengths(len(self), self._rows.means, lengths)
+        return lengths
+
     def _solved(self, fill, count: int) -> NDArray[np.float32]:
-        """Constants and coefficients (S, 1 + q, count) of the fields whose products with the rows `fill` writes."""
+        """Constants and coefficients (S, 1 + q, count) of the fields whose products with the rows `fill` writes.
+
+        The count is filled up to a multiple of DIRECTIONS.
+        """
         runtime.check_alive(self._grid.runtime)
-        products = np.zeros((max(len(self), 1), 1 + self._rank, count), np.float32)
+        products = np.zeros((max(len(self), 1), 1 + self._rank, _whole(count, decoding.DIRECTIONS)), np.float32)
         if len(self):
             fill(products)
             decoding.solve_rows(self._rank, len(self), self._grid.latents, self._grid.weights, self.settings.noise, products)
@@ -239,38 +234,37 @@ class LatentMap(BaseMap):
         return values, valid.astype(bool)
 
     def merge(self, other: LatentMap) -> None:
-        """Fuse another map of the same settings into this one: exact, up to the rounding of half precision."""
+        """Fuse another map of the same settings into this one: exact, up to the rounding of what is kept."""
         self._check_mergeable(other)
-        self._fuse_voxels(other._grid.export(), other._export_rows())
-
-    def _fuse_voxels(self, data: VoxelData, rows: NDArray[np.float16]) -> None:
+        data, rows = other._grid.export(), other._export_rows()
         n = len(data.keys)
         if n:
             slots = np.empty(n, np.int32)
             self._grid.claim(n, data.keys, data.weights, slots)
-            self._reserve_rows()
-            kernels.fuse_rows(n, slots, rows, data.weights, self._grid.weights, self._rows)
-            fusion.fuse(self._grid.rows, 1, 0, n, slots, data.latents, data.weights, data.masks, 1.0,
-                        self._grid.latents, self._grid.weights, self._grid.masks)
+            self._rows.reserve(self._grid.capacity, len(self))
+            kernels.fuse_voxels(self._rank, self._rows.bits8, n, data.keys, slots, rows.means, rows.slopes, rows.scales,
+                                data.latents, data.weights, self._workers, self._stride, self._scratch[-1],
+                                *self._rows.pools, self._grid.latents, self._grid.weights)
 
-    def _export_rows(self) -> NDArray[np.float16]:
-        """(N, 1 + q, c) in the order of `VoxelGrid.export`."""
-        order = np.lexsort(self._grid.voxel_keys().T[::-1]).astype(np.int32)
-        rows = np.empty((len(order), 1 + self._rank, self.channels), np.float16)
-        if len(order):
-            kernels.copy_rows(order, self._rows, rows)
-        return rows
+    def _export_rows(self) -> RowData:
+        """In the order of `VoxelGrid.export`."""
+        return self._rows.export(np.lexsort(self._grid.voxel_keys().T[::-1]).astype(np.int32))
 
     def _tensors(self) -> dict[str, NDArray]:
-        return {**super()._tensors(), "rows": self._export_rows()}
+        return {**super()._tensors(), **vars(self._export_rows())}
 
     def _restore_tensors(self, path: str | Path, tensors: dict[str, NDArray]) -> None:
         data = VoxelData(*(tensors.get(key) for key in ("keys", "latents", "weights", "masks")))
         self._check_data(path, data)
-        rows, wanted = tensors.get("rows"), (len(data.keys), 1 + self._rank, self.channels)
-        if rows is None or rows.shape != wanted or rows.dtype != np.float16 or not np.isfinite(rows).all():
-            raise MapCorrupt(f"{path}: tensor 'rows' should be {wanted} finite float16; write the map again")
-        self._fuse_voxels(data, rows)
+        rows = RowData(*(tensors.get(key) for key in ("means", "slopes", "scales")))
+        self._rows.check(path, len(data.keys), rows)
+        if len(data.keys):
+            slots = np.empty(len(data.keys), np.int32)
+            self._grid.claim(len(data.keys), data.keys, data.weights, slots)
+            fusion.fuse(self._grid.rows, 1, 0, len(slots), slots, data.latents, data.weights, data.masks, 1.0,
+                        self._grid.latents, self._grid.weights, self._grid.masks)
+            self._rows.reserve(self._grid.capacity, len(self))
+            self._rows.fill(slots, rows)
 
     def _observed(self, cloud: PointCloud) -> NDArray[np.float32]:
         return cloud.points
@@ -279,3 +273,8 @@ class LatentMap(BaseMap):
         raise NotImplementedError
 
     _encode_points = _encode_cells
+
+
+def _whole(count: int, step: int) -> int:
+    """The next multiple of a step."""
+    return -(-count // step) * step

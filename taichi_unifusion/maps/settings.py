@@ -110,8 +110,10 @@ class LatentSettings(MapSettings):
     """Observation noise d of the regression (Eq. 6) for one feature pixel, relative to the kernel's variance."""
     fusion: Literal["mean", "information"] = "information"
     """information: the regression runs over all frames at once; there is no other way here, as it costs no more memory."""
-    encoder: EncoderSettings = field(default_factory=lambda: EncoderSettings(rank=4))
-    """The position encoding; a voxel keeps so many numbers a channel: their mean and the eigenpairs from the second on."""
+    encoder: EncoderSettings = field(default_factory=lambda: EncoderSettings(rank=8))
+    """The position encoding; a voxel keeps so many numbers a channel: their mean, and slopes for eigenpairs from the second."""
+    precision: Literal["int8", "float16", "float32"] = "int8"
+    """What a voxel's numbers are kept in; int8: means in half precision, slopes in 8 bits and a scale for each."""
     source: str = ""
     """What made the features, as in clip:MODEL; written by the pipeline, and merged only with the same."""
 
@@ -120,6 +122,7 @@ class LatentSettings(MapSettings):
         if self.sampling != "cells" or self.fusion != "information":
             raise InputError("a map of features knows sampling 'cells' and fusion 'information' only, got "
                              f"'{self.sampling}' and '{self.fusion}'")
+        _check_choice("precision", self.precision, ("int8", "float16", "float32"))
         if not 2 <= self.encoder.rank <= MAX_LATENT_RANK:
             raise InputError(f"encoder: rank must lie in 2..{MAX_LATENT_RANK} in a map of features, got {self.encoder.rank}")
 
