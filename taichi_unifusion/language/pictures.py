@@ -18,19 +18,25 @@ HEAT = ((0.0, (0.46, 0.46, 0.50)), (0.35, (0.48, 0.30, 0.42)), (0.5, (0.78, 0.26
 NOTHING = (0.35, 0.35, 0.35)  # RGB of a vertex without a label
 GOLDEN = 0.618033988749895    # steps of hue that stay apart for any number of labels
 NEAR = 1.0                    # [m] a camera nearer than this shows too little around
-SWATCH, LEGEND_WIDTH = 26, 260  # [pixels]
+LABEL_CONTRAST = 0.35           # of a labelled surface's own light and dark
+LEGEND_WIDTH = 320              # [pixels]
+SWATCHES = 18, 38               # [pixels] a row of the legend may be high
 
 
 def heat_mesh(mesh: Mesh, relevance: NDArray) -> Mesh:
     """The mesh in colours of the relevance (V,), with its shades of light and dark; the numbers as attribute `relevance`."""
     levels, colors = np.array([level for level, _ in HEAT]), np.array([color for _, color in HEAT])
     heat = np.stack([np.interp(relevance, levels, colors[:, k]) for k in range(3)], axis=1)
-    shade = np.full((len(heat), 1), 0.5)
+    return _recolored(mesh, heat, 0.6).with_attribute("relevance", relevance)
+
+
+def _recolored(mesh: Mesh, colors: NDArray, contrast: float) -> Mesh:
+    """The mesh in other colours (V, 3), as much lighter and darker as its own were, by `contrast`."""
+    shade = np.full((len(colors), 1), 0.5)
     if mesh.attributes.get("color") is not None and mesh.attributes["color"].shape[1] == 3:
         shade = mesh.attributes["color"] @ np.array([[0.299], [0.587], [0.114]])
-    shaded = np.clip(heat * (0.65 + 0.6 * shade), 0, 1)
-    plain = Mesh(mesh.vertices, mesh.faces, mesh.normals)
-    return plain.with_attribute("color", shaded).with_attribute("relevance", relevance)
+    shaded = np.clip(colors * (0.95 + contrast * (shade - 0.5)), 0, 1)
+    return Mesh(mesh.vertices, mesh.faces, mesh.normals).with_attribute("color", shaded)
 
 
 def cameras_that_see(trajectory: Trajectory | None, point: NDArray, count: int = 3) -> Trajectory | None:
@@ -47,17 +53,16 @@ def cameras_that_see(trajectory: Trajectory | None, point: NDArray, count: int =
 
 def label_colors(count: int) -> NDArray[np.float64]:
     """(count, 3) RGB in [0, 1] that differ."""
-    return np.array([colorsys.hsv_to_rgb((0.02 + i * GOLDEN) % 1, (0.75, 0.45, 0.9)[i % 3], (0.95, 0.85, 0.65)[i // 3 % 3])
+    return np.array([colorsys.hsv_to_rgb((0.02 + i * GOLDEN) % 1, (0.65, 0.4, 0.8)[i % 3], (0.92, 0.8, 0.62)[i // 3 % 3])
                      for i in range(count)])
 
 
 def label_mesh(mesh: Mesh, found: Segmentation, labels: Sequence[int], colors: NDArray) -> Mesh:
     """The mesh in the colours of its names, with attributes `label`, -1 without one, and `confidence`."""
     known = found.labels != UNLABELLED
-    plain = Mesh(mesh.vertices, mesh.faces, mesh.normals)
     shown = np.where(known[:, None], colors[found.labels], np.array(NOTHING))
     numbers = np.where(known, np.array(labels)[found.labels], UNLABELLED)
-    return (plain.with_attribute("color", shown).with_attribute("label", numbers)
+    return (_recolored(mesh, shown, LABEL_CONTRAST).with_attribute("label", numbers)
             .with_attribute("confidence", found.confidence))
 
 
@@ -65,10 +70,13 @@ def segmentation_picture(mesh: Mesh, found: Segmentation, colors: NDArray, traje
     """Views of a labelled mesh (H, W, 3) RGB beside the names that occur in it, the commonest first."""
     picture = draw_preview(mesh, trajectory=trajectory)
     counts = np.bincount(found.labels[found.labels != UNLABELLED], minlength=len(found.names))
-    shown = [i for i in np.argsort(-counts, kind="stable") if counts[i]][:picture.shape[0] // SWATCH - 1]
-    legend = np.full((picture.shape[0], LEGEND_WIDTH, 3), 255, np.uint8)
-    for row, i in enumerate(shown):
-        top = 14 + row * SWATCH
-        legend[top:top + SWATCH - 8, 14:44] = (255 * colors[i] + 0.5).astype(np.uint8)
-        cv2.putText(legend, found.names[i][:24], (54, top + 14), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (40, 40, 40), 1, cv2.LINE_AA)
+    present = [i for i in np.argsort(-counts, kind="stable") if counts[i]]
+    height = picture.shape[0]
+    step = int(np.clip(height // (len(present) + 1), *SWATCHES))
+    legend = np.full((height, LEGEND_WIDTH, 3), 255, np.uint8)
+    for row, i in enumerate(present[:height // step - 1]):
+        top, size = step // 2 + row * step, step * 2 // 3
+        legend[top:top + size, 14:14 + 2 * size] = (255 * colors[i] + 0.5).astype(np.uint8)
+        cv2.putText(legend, found.names[i][:24], (26 + 2 * size, top + size - size // 6), cv2.FONT_HERSHEY_SIMPLEX, size / 32,
+                    (40, 40, 40), 1, cv2.LINE_AA)
     return np.hstack([picture, legend])
