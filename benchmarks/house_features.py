@@ -19,7 +19,7 @@ from taichi_unifusion.language import unit_length
 
 FEATURE_PIXEL = 8        # depth pixels along the edge of a feature pixel
 BLUR = 1.0               # [feature pixels] standard deviation
-SINGLE_FRAME = 0.5       # accuracy that the noise is made for
+SINGLE_FRAME = 0.5       # accuracy that the noise is made for, if nothing else is asked
 THIN = 0.03              # [m] one test point in a cube of this edge
 NAMES = {  # class of the house -> its nearest name in LVIS, which has none for walls, floors and doors: these take stand-ins
     "AirconditionerA": "air conditioner", "AirconditionerB": "air conditioner", "BalconyTable": "table", "Bed": "bed",
@@ -89,13 +89,13 @@ class HouseFeatures:
         return float(np.mean(shares))
 
 
-def find_noise(features: HouseFeatures, indices: range) -> float:
-    """The noise, by coordinate, at which a single frame is right in SINGLE_FRAME of its pixels; of a seed of its own."""
+def find_noise(features: HouseFeatures, indices: range, wanted: float = SINGLE_FRAME) -> float:
+    """The noise, by coordinate, at which a single frame is right in a share `wanted` of its pixels; of a seed of its own."""
     low, high = 0.0, 1.0
     for _ in range(7):
         middle = (low + high) / 2
         right = features.with_noise(middle, seed=12345).right(indices)
-        low, high = (middle, high) if right > SINGLE_FRAME else (low, middle)
+        low, high = (middle, high) if right > wanted else (low, middle)
     return (low + high) / 2
 
 

@@ -1,45 +1,43 @@
 """A map of image-text features against single frames and per-voxel averages, where the truth is known: memory, speed, answers.
 
-    python benchmarks/open_vocabulary.py PATH/aws-small-house PATH/clip-text-embeddings --path living --every 12
+    python benchmarks/open_vocabulary.py house PATH/aws-small-house PATH/clip-text-embeddings --path living --every 12
+    python benchmarks/open_vocabulary.py speed
 
 Features are those of house_features.py: real CLIP text vectors of what is seen, 80 x 60 a frame, blurred, with noise that makes
 a single frame right in about half of its pixels. The map is asked with the same vectors at points of views that
-were not mapped.
+were not mapped. `speed` takes random features in the synthetic room, and needs no data.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
-import time
 from pathlib import Path
 
+import feature_speed
 import numpy as np
 from house import PATHS, load_house
-from house_features import NAMES, HeldOut, HouseFeatures, find_noise, held_out_points
+from house_features import NAMES, SINGLE_FRAME, HeldOut, HouseFeatures, find_noise, held_out_points
 from numpy.typing import NDArray
 
 import taichi_unifusion as uf
-from taichi_unifusion import runtime
 from taichi_unifusion.datasets.scene import SceneDataset
 from taichi_unifusion.encoding import EncoderSettings
 from taichi_unifusion.evaluation.segmentation import evaluate_segmentation
 from taichi_unifusion.language.embeddings import TextEmbeddings, read_embeddings
 from taichi_unifusion.language.questions import ask
 from taichi_unifusion.maps import LatentMap
-from taichi_unifusion.run_log import RunResult
 from taichi_unifusion.terminal import format_table
 from taichi_unifusion.types import Mesh
 
 AVERAGED = (0.2, 0.1, 0.07, 0.05)  # [m] voxels of the averages
 DEPTH_MAX = 4.5              # [m] of the views that test points come from
-FULL_RANK = 20               # eigenpairs of the map as published
+PUBLISHED = "float32:20"     # precision and rank of the map that all others are compared with
 COMPARED = 2000              # points at which whole features are compared
 BASES = (32, 64, 128)        # directions of low-rank bases
 STAND_INS = ("cornice", "doormat", "knocker")  # of walls, floors and doors: what else is there, no objects
 MIN_POINTS = 30              # test points of an object that counts
 MATCH = 0.25                 # IoU of boxes above which a region is the object
-VERTICES = 500_000           # of the timed query
 
 
 class Averages:
@@ -69,13 +67,20 @@ class Averages:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("house", type=Path, help="folder with house.glb and objects.json")
-    parser.add_argument("embeddings", type=Path, help="folder with LVIS's CLIP vectors")
-    parser.add_argument("--path", default="living", choices=PATHS)
-    parser.add_argument("--every", type=int, default=12)
-    parser.add_argument("--seed", type=int, default=0, help="of the features' noise")
-    parser.add_argument("--out", type=Path, help="folder for the results of the run, to be asked by `unifusion query`")
-    run(parser.parse_args())
+    commands = parser.add_subparsers(required=True)
+    house = commands.add_parser("house", help="memory and answers, where the truth is known")
+    house.add_argument("house", type=Path, help="folder with house.glb and objects.json")
+    house.add_argument("embeddings", type=Path, help="folder with LVIS's CLIP vectors")
+    house.add_argument("--path", default="living", choices=PATHS)
+    house.add_argument("--every", type=int, default=12)
+    house.add_argument("--seed", type=int, default=0, help="of the features' noise")
+    house.add_argument("--right", type=float, default=SINGLE_FRAME, help="share of pixels in which a single frame is right")
+    house.add_argument("--variants", nargs="*", default=["float16:5", "int8:6"], help="PRECISION:RANK of maps beside ours")
+    house.add_argument("--out", type=Path, help="folder for the results of the run, to be asked by `unifusion query`")
+    house.set_defaults(run=run)
+    feature_speed.add_options(commands.add_parser("speed", help="seconds a frame and a query"))
+    options = parser.parse_args()
+    options.run(options)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -89,22 +94,19 @@ def run(options: argparse.Namespace) -> None:
     rows = np.array([names.index(NAMES[name]) for name in frames.class_names])
     mapped = range(0, len(frames), options.every)
     clean = HouseFeatures(frames, texts, rows, 0.0, options.seed)
-    features = clean.with_noise(find_noise(clean, mapped[::8]), options.seed)
+    features = clean.with_noise(find_noise(clean, mapped[::8], options.right), options.seed)
     print(f"{options.path}, {len(mapped)} frames, noise {features.noise:.3f} by coordinate: a single frame is right in "
           f"{features.right(mapped[::4]):.1%} of its pixels, without noise in {clean.right(mapped[::4]):.1%}\n", flush=True)
     pipeline = uf.Pipeline(uf.Config(), encoder=features)
     loaded = [frames[index] for index in mapped]
     result = pipeline.run(loaded)
-    full = LatentMap("features", texts.shape[1], encoder=EncoderSettings(rank=FULL_RANK))
-    averages, again, cpu_seconds = [Averages(voxel_size) for voxel_size in AVERAGED], LatentMap("features", texts.shape[1]), []
+    variants = {name: make_map(name, texts.shape[1]) for name in (PUBLISHED, *options.variants)}
+    averages = [Averages(voxel_size) for voxel_size in AVERAGED]
     for frame in loaded:
         frame = frame.with_features("features", features.image_features(frame))
         cloud = uf.preprocess(frame).transformed(frame.T_world_camera)
-        full.integrate(cloud)
-        started = time.process_time()
-        again.integrate(cloud)
-        runtime.synchronize()
-        cpu_seconds.append(time.process_time() - started)
+        for variant in variants.values():
+            variant.integrate(cloud)
         for average in averages:
             average.add(cloud.points, seen_products(cloud, texts))
     test = held_out_points(frames, features, range(mapped.step // 2, len(frames), mapped.step * 2), DEPTH_MAX)
@@ -115,10 +117,14 @@ def run(options: argparse.Namespace) -> None:
         from taichi_unifusion.results import write_results
 
         write_results(options.out, pipeline, result)
-    print(table_of_memory(pipeline.features, full, test, texts, names), "\n", flush=True)
-    mesh = pipeline.extract_mesh()
-    print(table_of_speed(result, cpu_seconds, pipeline.features, mesh, encoder), "\n", flush=True)
-    print(table_of_queries(pipeline.features, mesh, encoder, test, frames, names), flush=True)
+    print(table_of_memory(pipeline.features, variants, test, texts, names), "\n", flush=True)
+    print(table_of_queries(pipeline.features, pipeline.extract_mesh(), encoder, test, frames, names), flush=True)
+
+
+def make_map(name: str, channels: int) -> LatentMap:
+    """An empty map of PRECISION:RANK."""
+    precision, rank = name.split(":")
+    return LatentMap("features", channels, encoder=EncoderSettings(rank=int(rank)), precision=precision)
 
 
 def seen_products(cloud: uf.PointCloud, texts: NDArray) -> NDArray[np.float32]:
@@ -142,39 +148,39 @@ def table_of_answers(features: LatentMap, averages: list[Averages], test: HeldOu
     return format_table(rows)
 
 
-def table_of_memory(features: LatentMap, full: LatentMap, test: HeldOut, texts: NDArray, names: list[str]) -> str:
-    """Bytes, files and answers beside those of all eigenpairs, and of the same rows in a low-rank basis."""
-    channels = features.channels
-    step = max(len(test.points) // COMPARED, 1)
-    wanted = full.query(test.points[::step])
-    rows = [["map", "bytes a voxel", "of published", "MB", "file MB", "cosine mean", "cosine 1 %", "mIoU %"],
-            [f"as published: {FULL_RANK} x {channels} float32", f"{FULL_RANK * channels * 4:,}", "1", "", "", "", "", ""]]
-    variants = {f"{FULL_RANK} x {channels} float16": (full, full.memory_bytes),
-                f"{features.settings.encoder.rank} x {channels} float16 (ours)": (features, features.memory_bytes)}
-    for k in BASES:
-        smaller = len(features) * features.settings.encoder.rank * (channels - k) * 2
-        variants[f"{features.settings.encoder.rank} x {k}, basis of the means"] = (
-            in_basis(features, k), features.memory_bytes - smaller + 4 * k * channels)
-    for name, (variant, size) in variants.items():
-        found = variant.query(test.points[::step])
+def table_of_memory(ours: LatentMap, variants: dict[str, LatentMap], test: HeldOut, texts: NDArray, names: list[str]) -> str:
+    """Bytes, files and answers beside those of the map as published; and of ours in a basis of few directions."""
+    channels, full = ours.channels, variants[PUBLISHED]
+    points = test.points[::max(len(test.points) // COMPARED, 1)]
+    wanted, decoded = full.query(points), ours.query(points)
+    header = ["a voxel keeps", "bytes", "of published", "MB", "file MB", "cosine mean", "cosine 1 %", "mIoU %"]
+    settings, table = ours.settings, []
+
+    def add(name: str, size: float, stored: str, found: NDArray, scores: NDArray) -> None:
         cosines = (found * wanted).sum(axis=1) / (np.linalg.norm(found, axis=1) * np.linalg.norm(wanted, axis=1))
-        labels = variant.similarity(test.points, texts).argmax(axis=1)
-        score = evaluate_segmentation(labels, test.labels, names=dict(enumerate(names)))
-        stored = file_bytes(variant) if "basis" not in name else 0
-        rows.append([name, f"{size / len(variant):,.0f}", f"1/{FULL_RANK * channels * 4 * len(variant) / size:.1f}",
-                     f"{size / 1e6:.1f}", f"{stored / 1e6:.1f}" if stored else "-", f"{cosines.mean():.4f}",
-                     f"{np.percentile(cosines, 1):.4f}", f"{100 * score.mean_iou:.1f}"])
-    return format_table(rows) + f"\n{len(features):,} voxels; cosine with the {FULL_RANK} x {channels} map's features"
+        score = evaluate_segmentation(scores.argmax(axis=1), test.labels, names=dict(enumerate(names)))
+        table.append([name, f"{size:,.0f}", f"1/{full.settings.encoder.rank * channels * 4 / size:.1f}",
+                      f"{size * len(full) / 1e6:.1f}", stored, f"{cosines.mean():.4f}", f"{np.percentile(cosines, 1):.4f}",
+                      f"{100 * score.mean_iou:.1f}"])
+
+    for variant in (*variants.values(), ours):
+        rank, precision = variant.settings.encoder.rank, variant.settings.precision
+        add(f"{rank} x {channels} {precision}{' (ours)' * (variant is ours)}", variant.memory_bytes / len(variant),
+            f"{file_bytes(variant) / 1e6:.1f}", variant.query(points), variant.similarity(test.points, texts))
+    for k in BASES:
+        basis, per_channel = strongest_directions(ours, k), ours.memory_bytes / len(ours) / channels
+        projected = texts @ basis @ basis.T
+        add(f"{settings.encoder.rank} x {k} {settings.precision}, basis of the means",
+            per_channel * k + 4 * k * channels / len(ours), "-", decoded @ basis @ basis.T,
+            ours.similarity(test.points, projected) * np.linalg.norm(projected, axis=1))
+    return format_table([header, *table]) + f"\n{len(ours):,} voxels; cosine with the features of the first"
 
 
-def in_basis(features: LatentMap, k: int) -> LatentMap:
-    """The map with its rows projected onto the k strongest directions of its voxels' means, weighted."""
-    data, rows = features._grid.export(), features._export_rows()
-    means = rows[:, 0].astype(np.float32)
-    basis = np.linalg.eigh((means * data.weights[:, None]).T @ means)[1][:, -k:].astype(np.float32)
-    projected = LatentMap(features.name, features.channels, features.settings)
-    projected._fuse_voxels(data, ((rows.astype(np.float32) @ basis) @ basis.T).astype(np.float16))
-    return projected
+def strongest_directions(features: LatentMap, k: int) -> NDArray[np.float32]:
+    """(c, k) principal directions of the voxels' means by weight: what an online basis could at best have learned."""
+    means = features._export_rows().means.astype(np.float32)
+    weights = features._grid.export().weights
+    return np.linalg.eigh((means * weights[:, None]).T @ means)[1][:, -k:].astype(np.float32)
 
 
 def file_bytes(features: LatentMap) -> int:
@@ -182,29 +188,6 @@ def file_bytes(features: LatentMap) -> int:
         path = Path(folder) / "features.safetensors"
         features.save(path)
         return path.stat().st_size
-
-
-def table_of_speed(result: RunResult, cpu_seconds: list[float], features: LatentMap, mesh: Mesh,
-                   encoder: TextEmbeddings) -> str:
-    """Milliseconds a frame of the features' part, and of queries at many vertices; the first, which compiles, left out."""
-    times = [step.milliseconds["features"] for step in result.steps[1:]]
-    points = np.resize(mesh.vertices, (VERTICES, 3))
-    many = Mesh(points, np.empty((0, 3), np.int32))
-    text = encoder.text_features(["sofa"])
-    rows = [["step", "wall s", "CPU s"],
-            [f"integrate {features.channels} channels, median of {len(times)} frames", f"{np.median(times) / 1e3:.3f}",
-             f"{np.median(cpu_seconds[1:]):.3f}"]]
-    for name, work in {f"similarity of 1 text at {VERTICES:,} vertices": lambda: features.similarity(points, text),
-                       "the same with all its rivals and regions": lambda: ask(features, many, encoder, ["sofa"])}.items():
-        work()
-        walls, cpus = [], []
-        for _ in range(5):
-            wall, cpu = time.perf_counter(), time.process_time()
-            work()
-            walls.append(time.perf_counter() - wall)
-            cpus.append(time.process_time() - cpu)
-        rows.append([name, f"{np.median(walls):.2f}", f"{np.median(cpus):.2f}"])
-    return format_table(rows)
 
 
 def table_of_queries(features: LatentMap, mesh: Mesh, encoder: TextEmbeddings, test: HeldOut, frames: SceneDataset,
