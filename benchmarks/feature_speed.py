@@ -47,9 +47,9 @@ def run(options: argparse.Namespace) -> None:
     texts, mesh = encoder.text_features(names), Mesh(points, np.empty((0, 3), np.int32))
     asked = {
         f"one text at {options.vertices:,} vertices": lambda: features.similarity(points, texts[0]),
-        "the same as a query, with what names have in common and one rival": lambda: ask(
+        "the same as a query, against one rival and what names have in common": lambda: ask(
             features, mesh, encoder, names[:1], negatives=names[1:2]),
-        f"the same with {NAMES - 1} rivals": lambda: ask(features, mesh, encoder, names[:1], negatives=names[1:]),
+        f"the same against {NAMES - 1} rivals": lambda: ask(features, mesh, encoder, names[:1], negatives=names[1:]),
     }
     rows = [["step", "wall s", "CPU s"],
             [f"integrate {options.channels} channels, a frame of {len(clouds[0]):,} points", *medians(steps)]]
