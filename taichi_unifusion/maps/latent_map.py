@@ -99,7 +99,7 @@ class LatentMap(BaseMap):
         image, usable = self._usable(features.values)
         blocks = self._cells
         blocks.touch(cloud.points, self.voxel_size)
-        blocks.bin(cloud.points, [cloud.points], self.voxel_size)
+        blocks.bin(cloud.points, [], self.voxel_size)
         blocks.compact(1)
         pixels, seen, weights = self._find_pixels(blocks, features, usable)
         if not seen.any():
