@@ -82,7 +82,8 @@ def fuse_voxels(mean_f_a, mean_a, slopes_a, weight_a, mean_f_b, mean_b, slopes_b
 
 def decoded_rows(means, slopes, scales):
     """Mean and slopes (S, 1 + q, c) as numbers."""
-    return np.concatenate([means[:, None].astype(float), slopes.reshape(*scales.shape, -1) * scales[..., None].astype(float)], 1)
+    slopes = slopes.reshape(*scales.shape, -1) * scales[..., None].astype(float)
+    return np.concatenate([means[:, None].astype(float), slopes], axis=1)
 
 
 def project_rows(means, slopes, scales, directions):

@@ -1,8 +1,8 @@
 """High-dimensional features of the surface: regressed and fused as sums, solved only when they are asked for (Sec. IV-D).
 
-A voxel keeps running means over all that was seen in its doubled voxel: of the features y (its *mean*), of f and of f f^T for q
-position features f (its *moments*), and the covariances of f and y (its *slopes*, q rows). Eq. 19 fuses all of these exactly, the
-slopes with what the means moved, so that
+A voxel keeps running means over all that was seen in its doubled voxel: of the features y (its *mean*), of f and of f f^T for
+q position features f (its *moments*), and the covariances of f and y (its *slopes*, q rows). Eq. 19 fuses all of these
+exactly, the slopes with what the means moved, so that
 
     F = (E[f f^T] - E[f] E[f]^T + d / w I)^-1 cov(f, y)
 
