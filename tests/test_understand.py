@@ -124,7 +124,7 @@ def test_wrong_questions_end_with_one_sentence(made, embeddings, tmp_path, capfd
     wide = f"embeddings:{tmp_path / 'wide.npz'}"
     for arguments, message in (
             (["query", str(made), "red"], "give the text encoder"),
-            (["query", str(tmp_path), "red", "--text", f"embeddings:{embeddings}"], "no maps/features.safetensors"),
+            (["query", str(tmp_path / "none"), "red", "--text", f"embeddings:{embeddings}"], "no maps/features.safetensors"),
             (["query", str(made), "mauve", "--text", f"embeddings:{embeddings}"], "has no vector for 'mauve'"),
             (["query", str(made), "red", "--text", wide], "3 channels"),
             (["query", str(made), "red", "--text", "letters:x"], "clip, onnx, embeddings"),
@@ -134,6 +134,7 @@ def test_wrong_questions_end_with_one_sentence(made, embeddings, tmp_path, capfd
         assert cli.main(arguments) == 2
         error = capfd.readouterr().err
         assert message in error and "Traceback" not in error
+    assert not (tmp_path / "none").exists()  # a folder that is asked by mistake is not made
 
 
 def test_frames_without_features_still_give_their_surface(frames, tmp_path):

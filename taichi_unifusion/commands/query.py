@@ -50,8 +50,8 @@ def query(options: Query) -> int:
     from ..language.questions import ask
     from ..results import ResultsFolder
 
-    folder = ResultsFolder(check_writable(options.dir))
     understood = read_understood(options.dir, options.device)
+    folder = ResultsFolder(check_writable(options.dir))
     encoder = options.encoder(understood.features.settings.source)
     answers = ask(understood.features, understood.mesh, encoder, options.texts, negatives=options.negative,
                   threshold=options.threshold, min_area=options.min_area, templates=options.templates)

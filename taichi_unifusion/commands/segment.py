@@ -42,8 +42,8 @@ def segment(options: Segment) -> int:
     from ..results import ResultsFolder
 
     truth = _read_truth(options.truth) if options.truth else None
-    folder = ResultsFolder(check_writable(options.dir))
     understood = read_understood(options.dir, options.device)
+    folder = ResultsFolder(check_writable(options.dir))
     encoder = options.encoder(understood.features.settings.source)
     found = segment_points(understood.features, understood.mesh.vertices, encoder, tuple(names.values()),
                            templates=options.templates)
