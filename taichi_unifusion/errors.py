@@ -5,6 +5,8 @@ A message says what, where and what to do, in one sentence. The command line cat
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 class UniFusionError(Exception):
     """Root of every error that this package raises on purpose."""
@@ -56,3 +58,9 @@ class MapCorrupt(FileError):
 
 class MissingDependency(UniFusionError, ImportError):
     """An optional package is needed; the message holds the command that installs it."""
+
+
+def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
+    """Raise InputError, with the right ones, unless the value of `name` is one of the choices."""
+    if value not in choices:
+        raise InputError(f"{name}: '{value}' is unknown, choose one of {', '.join(choices)}")

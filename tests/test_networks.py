@@ -156,7 +156,7 @@ def test_a_model_of_another_kind_is_said(tmp_path, colors):
         make_property(f"saliency=onnx:{three},output=mask")
     blocky = write_network(tmp_path / "blocky.onnx", [("Reshape", ["image", "shape"], ["result"], {})],
                            {"shape": np.array([1, 3, 64, 64])}, open_shape(3), [1, 3, 64, 64])
-    with pytest.raises(InputError, match=r"blocky.onnx: fails on an image of 48x32 .*say size=WIDTHxHEIGHT"):
+    with pytest.raises(InputError, match=r"blocky.onnx: fails on an image of 48x32; .*say size=WIDTHxHEIGHT"):
         make_property(f"style=onnx:{blocky}").image(frame_of(colors))
 
 

@@ -21,7 +21,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DatasetError, FrameError, InputError, MissingDependency
+from ..errors import DatasetError, FrameError, MissingDependency, check_choice
 from ..types import Frame
 from .association import check_max_difference, nearest
 from .base import Dataset
@@ -41,8 +41,7 @@ FINER = 1.5                        # readings a pixel of the colour camera that 
 def open_k4a(path: Path, *, align: Literal["depth", "color"] = "depth", depth_scale: float | None = None,
              max_difference: float = MAX_DIFFERENCE) -> K4aFile:
     """The recording in file `path`; poses further than `max_difference` [s] from a depth image do not belong to it."""
-    if align not in ("depth", "color"):
-        raise InputError(f"align: '{align}' is unknown, choose one of depth, color")
+    check_choice("align", align, ("depth", "color"))
     check_max_difference(max_difference)
     return K4aFile(path, align, DEPTH_SCALE if depth_scale is None else depth_scale, max_difference)
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FrameError, InputError, MissingDependency
+from ..errors import FrameError, InputError
+from ..onnx_session import open_session, run_session
 from ..types import Frame
 from . import unit_length
 from .clip import NORMALIZATION, SHORT_SIDE
@@ -47,10 +47,8 @@ class OnnxImageEncoder:
         smaller = width < frame.color.shape[1]
         image = cv2.resize(frame.color, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
         image = ((image.astype(np.float32) / 255 - np.float32(self.mean)) / np.float32(self.std)).transpose(2, 0, 1)[None]
-        try:
-            (raw, *_) = self.session.run(None, {self.input.name: np.ascontiguousarray(image, IMAGE_TYPES[self.input.type])})
-        except Exception as error:  # onnxruntime has a class of its own for every kind
-            raise InputError(f"{self.name}: fails on an image of {width}x{height} ({_first_line(error)})") from error
+        raw = run_session(self.session, {self.input.name: np.ascontiguousarray(image, IMAGE_TYPES[self.input.type])},
+                          failure=f"{self.name}: fails on an image of {width}x{height}")
         features = unit_length(self._as_image(np.asarray(raw), height, width))
         if not np.isfinite(features).any():
             raise FrameError(f"{at}: {self.name} gives no finite feature")
@@ -98,10 +96,7 @@ class OnnxTextEncoder:
             part = tokens[first:first + step]
             padded = np.concatenate([part, np.repeat(part[-1:], step - len(part), axis=0)])
             feeds = {i.name: (padded if k == 0 else padded != 0).astype(TOKEN_TYPES[i.type]) for k, i in enumerate(self.inputs)}
-            try:
-                raw = self.session.run(None, feeds)[0]
-            except Exception as error:
-                raise InputError(f"{self.name}: fails on {len(part)} texts ({_first_line(error)})") from error
+            raw = run_session(self.session, feeds, failure=f"{self.name}: fails on {len(part)} texts")
             found.append(np.asarray(raw)[:len(part)])
         vectors = np.concatenate(found)
         if vectors.ndim != 2 or not np.isfinite(vectors).all():
@@ -127,36 +122,5 @@ def onnx_text_encoder(file: str, *, tokenizer: str | Path | None = None, device:
     return OnnxTextEncoder(file, ClipTokenizer(tokenizer), device)
 
 
-def open_session(file: str, device: str) -> Any:
-    """An inference session; raises FileError for a file that is missing or no model, MissingDependency without onnxruntime."""
-    onnxruntime = _import_onnxruntime()
-    if not Path(file).is_file():
-        raise FileError(f"{file}: no such file")
-    if device not in ("auto", "cpu", "cuda"):
-        raise InputError(f"device: '{device}' is unknown, choose one of auto, cpu, cuda")
-    has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
-    if device == "cuda" and not has_cuda:
-        raise MissingDependency("device: this onnxruntime has no CUDA; pip install onnxruntime-gpu, or say cpu")
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # what goes wrong is said here
-    providers = ["CUDAExecutionProvider"] * (has_cuda and device != "cpu") + ["CPUExecutionProvider"]
-    try:  # by path, so that weights in files beside it are found
-        return onnxruntime.InferenceSession(str(file), options, providers=providers)
-    except Exception as error:
-        raise FileError(f"{file}: not an ONNX model that onnxruntime can run ({_first_line(error)})") from error
-
-
-def _import_onnxruntime() -> ModuleType:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise MissingDependency("ONNX models are run by onnxruntime: pip install 'taichi-unifusion[models]'") from None
-    return onnxruntime
-
-
 def _described(inputs: Sequence[Any]) -> str:
     return ", ".join(f"{each.name} {each.shape} {each.type}" for each in inputs)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:160]

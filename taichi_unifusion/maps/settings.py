@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from ..encoding import EncoderSettings
-from ..errors import InputError
+from ..errors import InputError, check_choice
 
 MAX_LATENT_RANK = 20  # of a map of features: its kernels unroll over it
 
@@ -41,8 +41,8 @@ class MapSettings:
             raise InputError(f"min_points: must be at least 1, got {self.min_points}")
         if self.margin not in (1, 2):
             raise InputError(f"margin: must be 1 or 2 cells, got {self.margin}")
-        _check_choice("sampling", self.sampling, ("cells", "points"))
-        _check_choice("fusion", self.fusion, ("mean", "information"))
+        check_choice("sampling", self.sampling, ("cells", "points"))
+        check_choice("fusion", self.fusion, ("mean", "information"))
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class SurfaceSettings(MapSettings):
             raise InputError(f"support_closing: must lie in 1..27 neighbours, got {self.support_closing}")
         if not -127 <= self.min_evidence <= 127:
             raise InputError(f"min_evidence: must lie in -127..127 frames, got {self.min_evidence}")
-        _check_choice("gpis", self.gpis, ("samples", "derivatives"))
+        check_choice("gpis", self.gpis, ("samples", "derivatives"))
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class PropertySettings(MapSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_choice("prior", self.prior, ("mean", "zero"))
+        check_choice("prior", self.prior, ("mean", "zero"))
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,3 @@ class LatentSettings(MapSettings):
         _check_choice("precision", self.precision, ("int8", "float16", "float32"))
         if not 2 <= self.encoder.rank <= MAX_LATENT_RANK:
             raise InputError(f"encoder: rank must lie in 2..{MAX_LATENT_RANK} in a map of features, got {self.encoder.rank}")
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise InputError(f"{name}: '{value}' is unknown, choose one of {', '.join(choices)}")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import check_choice
 
 COLORMAPS = {  # name -> OpenCV's number of it; None: made here
     "viridis": cv2.COLORMAP_VIRIDIS,
@@ -24,8 +24,7 @@ BLUE, WHITE, RED = (40.0, 10.0, -50.0), (95.0, 0.0, 0.0), (40.0, 60.0, 35.0)  # 
 
 def check_colormap(name: str) -> None:
     """Raise InputError for an unknown colour map."""
-    if name not in COLORMAPS:
-        raise InputError(f"colormap: '{name}' is unknown, choose one of {', '.join(COLORMAPS)}")
+    check_choice("colormap", name, COLORMAPS)
 
 
 @lru_cache

@@ -5,15 +5,15 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FrameError, InputError, MissingDependency
+from ..errors import FileError, FrameError, InputError, check_choice
 from ..io import read_bytes
+from ..onnx_session import open_session, run_session
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
@@ -45,18 +45,9 @@ class ImageNetwork:
     def __init__(self, file: str | Path, *, channels: int, size: tuple[int, int] | None = None, output: str = "",
                  device: str = "auto", sha256: str = "") -> None:
         self.file, self.channels = Path(file), channels
-        data = read_bytes(self.file)
-        found = hashlib.sha256(data).hexdigest()
-        if sha256 and found != sha256.lower():
+        if sha256 and (found := hashlib.sha256(read_bytes(self.file)).hexdigest()) != sha256.lower():
             raise FileError(f"{file}: has the SHA-256 {found}, not {sha256}; download the model again")
-        onnxruntime = _import_onnxruntime()
-        providers = _providers(onnxruntime, device)
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = 4  # what goes wrong is said here
-        try:  # by path, so that weights in files beside it are found
-            self.session = onnxruntime.InferenceSession(str(self.file), options, providers=providers)
-        except Exception as error:  # onnxruntime has a class of its own for every kind
-            raise FileError(f"{file}: not an ONNX model that onnxruntime can run ({_first_line(error)})") from error
+        self.session = open_session(self.file, device)
         self.input, self.channels_first, self.size = self._check_input(size)
         names = [item.name for item in self.session.get_outputs()]
         if output and output not in names:
@@ -98,12 +89,9 @@ class ImageNetwork:
         if dtype is np.uint8:
             image = np.clip(np.rint(image), 0, 255)
         tensor = np.ascontiguousarray((image.transpose(2, 0, 1) if self.channels_first else image)[None], dtype)
-        try:
-            (raw,) = self.session.run([self.output], {self.input.name: tensor})
-        except Exception as error:
-            raise InputError(f"{self.file}: fails on an image of {image.shape[1]}x{image.shape[0]} ({_first_line(error)}); "
-                             "if it needs another, say size=WIDTHxHEIGHT") from error
-        values = self._as_image(np.asarray(raw))
+        failure = (f"{self.file}: fails on an image of {image.shape[1]}x{image.shape[0]}; if it needs another, say "
+                   "size=WIDTHxHEIGHT")
+        values = self._as_image(np.asarray(run_session(self.session, {self.input.name: tensor}, self.output, failure=failure)))
         if not np.isfinite(values).all():
             raise FrameError(f"{self.file} gives {np.mean(~np.isfinite(values)):.0%} NaN or infinite values")
         if values.shape[:2] != shape:
@@ -123,29 +111,3 @@ class ImageNetwork:
         raise InputError(f"{self.file}: its output '{self.output}' is {raw.shape} {raw.dtype}, not an image of {self.channels} "
                          f"channel{'s' * (self.channels > 1)}; outputs: "
                          f"{', '.join(item.name for item in self.session.get_outputs())}")
-
-
-def _import_onnxruntime() -> ModuleType:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise MissingDependency("ONNX models are run by onnxruntime: pip install 'taichi-unifusion[models]'") from None
-    return onnxruntime
-
-
-def _providers(onnxruntime: ModuleType, device: str) -> list[str]:
-    check_choice("device", device, ("auto", "cpu", "cuda"))
-    has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
-    if device == "cuda" and not has_cuda:
-        raise MissingDependency("device: this onnxruntime has no CUDA; pip install onnxruntime-gpu, or say device=cpu")
-    return ["CUDAExecutionProvider"] * (has_cuda and device != "cpu") + ["CPUExecutionProvider"]
-
-
-def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Raise InputError unless the value is one of the choices."""
-    if value not in choices:
-        raise InputError(f"{name}: '{value}' is unknown, choose one of {', '.join(choices)}")
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__
