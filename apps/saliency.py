@@ -18,4 +18,7 @@ def main(format: str, path: str, out: str, network: str = "") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except uf.UniFusionError as error:
+        sys.exit(str(error))

@@ -4,6 +4,7 @@
     python benchmarks/properties.py sharing                 # the time that a second property of three channels adds
     python benchmarks/properties.py quality synthetic       # PSNR at held-out frames: colour, infrared-like, styles
     python benchmarks/properties.py quality house PATH      # the same in the flat of aws-robomaker-small-house-world
+    python benchmarks/properties.py flicker house PATH --out docs/flicker.jpg    # change from view to view, with a picture
 
 Times are of this process's processors (CPU seconds by threads in use), because other programs share the machine; on a GPU, of
 the clock. Frames are loaded and property images made before; every map takes its turn at every frame.
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -24,6 +26,7 @@ from taichi_unifusion import runtime
 from taichi_unifusion.maps import PropertyGroup
 from taichi_unifusion.properties import SurfaceProperty, make_property
 
+STYLES, SHOWN_STYLE = ("painting", "opencv", "sketch"), "sketch"
 PAPER_MS = {"surface": 100, "color": 38, "infrared": 45, "style": 48, "saliency": 45}  # Table VIII, a GPU, 1280x720
 
 
@@ -96,22 +99,18 @@ def sharing(frames: int) -> None:
 
 def quality(scene: str, path: str | None, voxel_sizes: Sequence[float]) -> None:
     """PSNR [dB] of every property at the points of frames that were not mapped, by voxel size."""
-    if scene == "house":
-        from house import load_house
-
-        recording = load_house(path, "living", noise=True)[:120:6]
-    else:
-        recording = uf.open_dataset("synthetic", frames=60)[:20]
+    recording = open_scene(scene, path)[:120:6] if scene == "house" else open_scene(scene, path)[:20]
     properties = [make_property(text) for text in (
-        "infrared=linear,name=infrared", "style,name=painting", "style=opencv,name=opencv", "style=sketch,name=sketch")]
+        "infrared=linear,name=infrared", "saliency", *(f"style={style},name={style}" for style in STYLES))]
     frames = [cloud_of(with_images(recording[i], properties)) for i in range(len(recording))]
-    held_out = frames[2::4]
+    left_out = range(2, len(frames), 4) or [len(frames) - 1]
+    held_out = [frames[i] for i in left_out]
     for voxel_size in voxel_sizes:
         maps = [uf.PropertyMap("color", 3, voxel_size=voxel_size)]
         maps += [uf.PropertyMap(each.name, each.channels, voxel_size=voxel_size) for each in properties]
         group = PropertyGroup(maps)
         for i, cloud in enumerate(frames):
-            if i % 4 != 2:
+            if i not in left_out:
                 group.integrate(cloud)
         found = {}
         for each in maps:
@@ -125,18 +124,43 @@ def quality(scene: str, path: str | None, voxel_sizes: Sequence[float]) -> None:
         del maps, group
 
 
+def flicker(scene: str, path: str | None, frames: int, voxel_size: float, out: str | None) -> None:
+    """How much styles change from view to view at the same points of the surface, and how much the map does."""
+    from properties_flicker import look, mean_changes, write_sheet
+
+    views = look(open_scene(scene, path), frames, STYLES, voxel_size)
+    for name, (images, renderings) in mean_changes(views).items():
+        print(f"{scene}, {100 * voxel_size:g} cm, {name}: its images change by {images:.2f} % of the range from view to view, "
+              f"the map's renderings by {renderings:.2f} %", flush=True)
+    if out:
+        write_sheet(Path(out), views[-3:], SHOWN_STYLE)
+
+
+def open_scene(scene: str, path: str | None) -> uf.Dataset:
+    if scene == "house":
+        from house import load_house
+
+        return load_house(path, "living")
+    return uf.open_dataset(scene, path, **({"frames": 60} if scene == "synthetic" else {}))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("cost", "sharing", "quality"))
-    parser.add_argument("scene", nargs="?", choices=("synthetic", "house"), default="synthetic")
-    parser.add_argument("path", nargs="?", help="folder of the house's GLB")
-    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("what", choices=("cost", "sharing", "quality", "flicker"))
+    parser.add_argument("scene", nargs="?", choices=("synthetic", "house", "replica"), default="synthetic")
+    parser.add_argument("path", nargs="?", help="folder of the house's GLB, or of a recording of Replica")
+    parser.add_argument("--frames", type=int, default=12, help="how many (not for quality)")
     parser.add_argument("--voxel-sizes", type=float, nargs="+", default=(0.02, 0.05, 0.1))
+    parser.add_argument("--out", help="picture of flicker, a JPEG file")
     parser.add_argument("--device", default="auto")
     options = parser.parse_args()
+    if options.what == "flicker" and options.scene == "replica":
+        parser.error("flicker needs a scene whose exact depth is known: synthetic or house")
     uf.init(options.device)
     if options.what == "quality":
         quality(options.scene, options.path, options.voxel_sizes)
+    elif options.what == "flicker":
+        flicker(options.scene, options.path, options.frames, options.voxel_sizes[0], options.out)
     else:
         {"cost": cost, "sharing": sharing}[options.what](options.frames)
 

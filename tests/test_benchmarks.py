@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,16 +13,19 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import house  # noqa: E402
+import properties_flicker  # noqa: E402
 import quality  # noqa: E402
 import quality_pictures  # noqa: E402
 from quality_methods import METHODS, method  # noqa: E402
 from quality_scenes import split  # noqa: E402
 
+from taichi_unifusion import Frame, PinholeCamera  # noqa: E402
 from taichi_unifusion.errors import InputError  # noqa: E402
 
 SMOOTH = 0.5         # share by which the motion may change from one frame to the next
 CLEARANCE = 0.35     # [m] of a camera centre to what it sees: no hand passes nearer
 ROUNDING = 1e-12
+RESAMPLED = 2e-3     # of colours that change slowly over a wall, between pixels
 
 
 @pytest.mark.parametrize("name", house.PATHS)
@@ -94,3 +98,29 @@ def test_methods_are_named_or_files(tmp_path):
     for unknown in ("tsdf", "tsdf-1cm-t8", "TSDF-1cm"):
         with pytest.raises(InputError, match="tsdf-1cm"):
             method(unknown)
+
+
+def wall_seen_from(x: float, tint: float) -> properties_flicker.HeldOut:
+    """A wall 2 m ahead whose colour runs with the place, from `x` metres to the right; its style images are off by `tint`."""
+    camera, T = PinholeCamera(64, 48, 60, 60, 31.5, 23.5), np.eye(4)
+    T[0, 3] = x
+    depth = np.full((48, 64), 2.0, np.float32)
+    v, u = np.indices(depth.shape)
+    place = np.dstack([(u - camera.cx) / 60 * 2 + x, (v - camera.cy) / 60 * 2, np.zeros(depth.shape)])
+    color = np.float32(0.5 + 0.2 * np.sin(place))
+    covered = np.ones(depth.shape, bool)
+    covered[:, 20:30] = False  # as seen from here
+    return properties_flicker.HeldOut(Frame(depth, camera, None, T), depth, {"color": color, "style": color + np.float32(tint)},
+                                      {"color": color, "style": color}, covered)
+
+
+def test_flicker_is_the_change_at_the_same_points(tmp_path):
+    """A camera that moves past a wall sees no change of its colour; a tint that comes and goes is one, of its size."""
+    views = [wall_seen_from(0.13 * n, 0.1 * (n % 2)) for n in range(4)]
+    found = properties_flicker.mean_changes(views)
+    assert max(found["color"]) < 100 * RESAMPLED and found["style"][1] < 100 * RESAMPLED
+    assert found["style"][0] == pytest.approx(10, abs=100 * RESAMPLED)
+    change = properties_flicker.changes(views[0], views[1])[0]["color"]
+    assert np.isnan(change[:, 20:30]).all() and np.isnan(change[:, :3]).all() and np.isfinite(change[:, 40:60]).all()
+    properties_flicker.write_sheet(tmp_path / "sheet.jpg", views, "style")
+    assert cv2.imread(str(tmp_path / "sheet.jpg")).shape == (3 * 216, 5 * 288, 3)

@@ -46,6 +46,20 @@ def test_a_constant_comes_back_on_the_lattice_of_voxel_centres(target):
     assert valid.any() and np.abs(values[valid] - RGB).max() < CONSTANT
 
 
+@pytest.mark.parametrize("blend", [True, False])
+@pytest.mark.parametrize("fusion", ["mean", "information"])
+@pytest.mark.parametrize("sampling", ["cells", "points"])
+def test_a_constant_comes_back_of_several_frames_in_every_mode(sampling, fusion, blend):
+    """Two frames that overlap in part, one of them thin: voxels hold one point or hundreds, of one frame or of both."""
+    color = PropertyMap("rgb", 3, voxel_size=0.04, sampling=sampling, fusion=fusion, blend=blend)
+    color.integrate(colored(rectangle((0, 0, 0), (0.3, 0, 0.1), (0, 0.3, 0), 0.01), RGB))
+    color.integrate(colored(rectangle((0.2, 0.1, 0), (0.3, 0, 0), (0, 0.3, 0), 0.03), RGB))
+    points = np.random.default_rng(2).uniform((-0.4, -0.4, -0.2), (0.6, 0.5, 0.2), (20_000, 3))
+    values, valid = color.query(points, return_valid=True)
+    assert 0.05 < valid.mean() < 0.9
+    assert np.abs(values[valid] - RGB).max() < CONSTANT
+
+
 def test_a_linear_property_comes_back_on_the_surface(target):
     plane = rectangle((2, 0, 0), (0.39, 0, 0), (0, 0.39, 0.0975), 0.01)
     values, valid = target.query(plane.points, return_valid=True)
