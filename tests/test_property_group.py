@@ -7,6 +7,7 @@ import pytest
 from scenes import cloud_of, rough
 
 from taichi_unifusion import PointCloud, PropertyMap, load_map
+from taichi_unifusion.encoding import EncoderSettings
 from taichi_unifusion.errors import CapacityError, InputError
 from taichi_unifusion.maps import PropertyGroup
 from taichi_unifusion.maps.frame_blocks import FrameBlocks
@@ -14,8 +15,9 @@ from taichi_unifusion.maps.property_group import group_maps
 
 SAME = 2e-5  # relative to values of the size of 3: another width of the right side may be summed in another order
 CHANNELS = {"one": 1, "rgb": 3}
-SETTINGS = [{"sampling": "cells", "prior": "zero", "fusion": "mean", "voxel_size": 0.05},
-            {"sampling": "points", "prior": "mean", "fusion": "information", "voxel_size": 0.05}]
+SMALL = {"voxel_size": 0.05, "encoder": EncoderSettings(rank=4)}  # compiles in half the time
+SETTINGS = [{"sampling": "cells", "prior": "zero", "fusion": "mean", **SMALL},
+            {"sampling": "points", "prior": "mean", "fusion": "information", **SMALL}]
 
 
 def maps_of(**settings) -> list[PropertyMap]:
