@@ -77,13 +77,6 @@ def test_S4_several_containers_are_named(tmp_path):
         open_dataset("scannet", tmp_path)
 
 
-def test_replica_without_trajectory(tmp_path):
-    folder = write_replica(tmp_path, make_samples(1))
-    (folder / "traj.txt").unlink()
-    with pytest.raises(DatasetError, match="no traj.txt"):
-        open_dataset("replica", folder)
-
-
 @pytest.mark.parametrize("K, said", [(np.diag([0.0, 14, 1]), "must be positive"), (np.diag([-15.0, 14, 1]), "must be positive"),
                                      (np.diag([np.nan, 14, 1]), "finite"),
                                      (np.array([[15.0, 0, 400], [0, 14, 6], [0, 0, 1]]), "intrinsics of another resolution"),

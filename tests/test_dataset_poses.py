@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from dataset_writers import (CAMERA, START, make_pose, make_samples, matrix_text, numbers, quaternion, tum_row, write_folder,
-                             write_replica, write_scannet, write_sens, write_seven_scenes, write_tum)
+                             write_replica, write_scannet, write_scannet_flat, write_sens, write_seven_scenes, write_tum)
 
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.association import associate, nearest
@@ -277,12 +279,26 @@ def test_S3_max_difference_must_be_usable(tmp_path, gap):
         open_dataset("tum", folder, camera=CAMERA, max_difference=gap)
 
 
-def test_tum_without_ground_truth_has_no_poses_and_says_so(tmp_path):
-    folder = write_tum(tmp_path, make_samples(2))
-    (folder / "groundtruth.txt").unlink()
-    dataset = open_dataset("tum", folder, camera=CAMERA)
-    assert dataset[0].T_world_camera is None
-    assert any("groundtruth.txt: no such file" in warning for warning in dataset.warnings)
+@pytest.mark.parametrize(("format", "write", "poses", "camera"), [
+    ("replica", write_replica, "traj.txt", None), ("7scenes", write_seven_scenes, "frame-*.pose.txt", None),
+    ("scannet", write_scannet, "pose", None), ("scannet", write_scannet_flat, "frame-*.pose.txt", None),
+    ("tum", write_tum, "groundtruth.txt", CAMERA), ("folder", write_folder, "poses", None)])
+def test_S2_without_any_pose_the_frames_are_there_and_what_is_missing_is_said(format, write, poses, camera, tmp_path):
+    folder = write(tmp_path / "recording", make_samples(2))
+    for path in folder.glob(poses):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    dataset = open_dataset(format, folder, camera=camera)
+    assert [frame.T_world_camera for frame in dataset] == [None, None]
+    assert poses.replace("*", "XXXXXX") in dataset.no_poses and str(folder) in dataset[:1].no_poses
+    assert sum("the frames have no poses" in warning for warning in dataset.warnings) == 1
+    assert not any("pose" in warning for warning in dataset.without_poses().warnings)  # nobody asked for them
+
+
+def test_replica_images_without_a_trajectory_beside_their_camera(tmp_path):
+    folder = write_replica(tmp_path, make_samples(2))
+    (folder / "traj.txt").unlink()
+    dataset = open_dataset("replica", folder / "results")
+    assert dataset.camera == CAMERA and dataset.no_poses == f"{folder / 'traj.txt'}: no such file"
 
 
 def brute_force(a, b, max_difference):

@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from dataset_writers import make_samples, write_replica
 from tiny_recording import FLAGS
 
 from taichi_unifusion import cli
@@ -72,6 +73,16 @@ def test_results_of_tracking_do_not_outlive_it(found, tmp_path):
     (tmp_path / "tracking.csv").write_text("of an earlier run")
     assert cli.main([*FEW, "--out", str(tmp_path)]) == 0
     assert not (tmp_path / "tracking.csv").exists()
+
+
+@pytest.mark.parametrize("mode", ["given", "internal"])
+def test_S2_a_recording_without_poses_is_one_sentence_that_says_what_is_missing(mode, tmp_path, capsys):
+    folder = write_replica(tmp_path / "office", make_samples(2))
+    (folder / "traj.txt").unlink()
+    assert cli.main(["reconstruct", "replica", str(folder), "--tracking", mode, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1 and f"{folder / 'traj.txt'}: no such file" in said[0] and "--tracking rgbd" in said[0]
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("options", "told"), [

@@ -55,6 +55,7 @@ class Reconstruct(ReconstructOptions):
 def reconstruct(options: Reconstruct, encoder: ImageEncoder | None = None) -> int:
     """Frames -> maps -> mesh -> results folder; with an image encoder also a map of its features."""
     frames = options.frames()
+    options.check_poses(frames)
     from ..results import prepare_results, remove_temporaries
 
     directory = prepare_results(options.out)

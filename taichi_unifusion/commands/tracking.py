@@ -12,6 +12,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from ..config import Config
 from ..datasets import Dataset
+from ..errors import DatasetError
 from ..terminal import frame_progress
 from .recording import RecordingOptions
 
@@ -34,6 +35,12 @@ class TrackingOptions:
     def tracked(self) -> bool:
         """Whether poses come from elsewhere than the recording, or are meant to."""
         return self.tracking != "given" or self.trajectory is not None or self.interpolate
+
+    def check_poses(self, frames: Dataset) -> None:
+        """Say at once that a recording has no poses where they are needed."""
+        if frames.no_poses and self.trajectory is None and self.tracking in ("given", "internal"):
+            raise DatasetError(f"{frames.no_poses}, so the frames have no poses; find them from the frames alone with --tracking "
+                               "rgbd, or take another program's with --tracking external --trajectory FILE")
 
     def track(self, recording: RecordingOptions, settings: Config, directory: Path,
               stop: Callable[[], bool]) -> tuple[Dataset, dict[str, object]]:

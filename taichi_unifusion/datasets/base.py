@@ -18,6 +18,7 @@ class Dataset(ABC, Sequence[Frame]):
 
     name: str
     warnings: tuple[str, ...] = ()
+    no_poses: str = ""  # why none of its frames has a pose, where that is so
     runs_kernels: bool = False  # whether loading launches kernels: those of two threads must not overlap
 
     @abstractmethod
@@ -52,7 +53,7 @@ class DatasetView(Dataset):
 
     def __init__(self, dataset: Dataset, indices: range) -> None:
         self.dataset, self.indices = dataset, indices
-        self.name, self.warnings = dataset.name, dataset.warnings
+        self.name, self.warnings, self.no_poses = dataset.name, dataset.warnings, dataset.no_poses
 
     def __len__(self) -> int:
         return len(self.indices)

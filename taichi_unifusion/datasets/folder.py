@@ -48,7 +48,8 @@ def open_folder(path: Path, *, depth_scale: float | None = None, camera: Pinhole
     source = str(path / CAMERA_FILE) if camera is None else "camera"
     camera = check_size(camera or settings.camera(source), depth_size(frames), source)
     return Recording(f"folder {path}", frames, camera, settings.depth_scale if depth_scale is None else depth_scale,
-                     invalid=settings.depth_invalid, fit_color=True, drop_alpha=drop_alpha)
+                     invalid=settings.depth_invalid, fit_color=True, drop_alpha=drop_alpha,
+                     no_poses="" if any(poses) else f"{path}: no poses.txt and no poses/ here")
 
 
 def in_order(stems: Iterable[str]) -> list[str]:

@@ -37,17 +37,19 @@ class FrameFiles:
 class Recording(Dataset):
     """Frames read from files when asked for.
 
-    `depth_scale` is in units a metre, `invalid` the units that mean no reading, `fit_color` resamples colour of another size.
+    `depth_scale` is in units a metre, `invalid` the units that mean no reading, `fit_color` resamples colour of another size,
+    `no_poses` says what is missing where no frame has a pose.
     """
 
     def __init__(self, name: str, frames: Sequence[FrameFiles], camera: PinholeCamera, depth_scale: float, *,
                  invalid: Collection[int] = INVALID_DEPTH, fit_color: bool = False, drop_alpha: bool = False,
-                 warnings: Iterable[str] = ()) -> None:
+                 warnings: Iterable[str] = (), no_poses: str = "") -> None:
         self.name, self.frames, self.camera = name, tuple(frames), camera
         self.depth_scale = check_depth_scale(depth_scale, name)
         self.invalid, self.fit_color, self.drop_alpha = tuple(invalid), fit_color, drop_alpha
         poses = [frame.pose for frame in self.frames if frame.pose is not None]
-        self.pose_warnings = tuple(pose_warnings(poses))
+        self.no_poses = no_poses
+        self.pose_warnings = (f"{no_poses}, so the frames have no poses",) if no_poses else tuple(pose_warnings(poses))
         self.warnings = (*warnings, *camera_warnings(camera), *self.pose_warnings)
 
     def __len__(self) -> int:

@@ -2,8 +2,8 @@
 
 The images may also lie beside traj.txt. Depth: 16 bits, 6553.5 units a metre; 65535 is 10 m or more and taken as no reading.
 Poses: row i of traj.txt, 16 numbers, is the 4x4 camera-to-world matrix of frame *number* i in metres, camera x right, y down,
-z forward. Intrinsics and depth scale: `cam_params.json` beside traj.txt or one folder up, else 1200x680, fx = fy = 600,
-cx 599.5, cy 339.5.
+z forward; without the file frames have none. Intrinsics and depth scale: `cam_params.json` beside traj.txt or one folder up,
+else 1200x680, fx = fy = 600, cx 599.5, cy 339.5.
 """
 
 from __future__ import annotations
@@ -26,35 +26,34 @@ DEFAULT_CAMERA = PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)
 def open_replica(path: Path, *, depth_scale: float | None = None, camera: PinholeCamera | None = None,
                  drop_alpha: bool = False) -> Recording:
     """The scene in folder `path`, which holds traj.txt (or is the results folder beside it)."""
-    trajectory = first_existing([path / "traj.txt"] + [path.parent / "traj.txt"] * (path.name == "results"))
+    beside = path.parent if path.name == "results" else path  # where the trajectory is expected
+    trajectory = first_existing([path / "traj.txt", beside / "traj.txt"])
     images = path / "results" if (path / "results").is_dir() else path
     color = numbered_files(images, r"frame(\d+)\.(?:jpg|jpeg|png)")
     depth = numbered_files(images, r"depth(\d+)\.png")
     if not color and not depth:
         raise DatasetError(f"{images}: no frameXXXXXX.jpg or depthXXXXXX.png here")
-    if trajectory is None:
-        raise DatasetError(f"{path}: no traj.txt here; it holds the poses, one 4x4 matrix a row")
-    rows = read_matrix_rows(trajectory)
+    numbers = sorted({*color, *depth})
+    poses, warnings = ([None] * len(numbers), []) if trajectory is None else _read_poses(numbers, trajectory)
     frames = [FrameFiles(file_of(number, depth, images, "depth{:06d}.png"), file_of(number, color, images, "frame{:06d}.jpg"),
-                         _pose_of(number, rows, trajectory))
-              for number in sorted({*color, *depth})]
-    read_camera, read_scale = _read_parameters(trajectory.parent)
+                         pose) for number, pose in zip(numbers, poses, strict=True)]
+    read_camera, read_scale = _read_parameters(trajectory.parent if trajectory else beside)
     source = "camera" if camera is not None else f"{path}: Replica's usual camera or cam_params.json"
     camera = check_size(camera or read_camera, depth_size(frames), source)
     return Recording(f"replica {path}", frames, camera, read_scale if depth_scale is None else depth_scale,
-                     drop_alpha=drop_alpha, warnings=_extra_rows(rows, max({*color, *depth}), trajectory))
+                     drop_alpha=drop_alpha, warnings=warnings,
+                     no_poses="" if trajectory else f"{beside / 'traj.txt'}: no such file")
 
 
-def _pose_of(number: int, rows: Sequence[Pose], trajectory: Path) -> Pose:
-    if number < len(rows):
-        return rows[number]
-    return Pose(str(trajectory), problem=f"holds {len(rows)} rows, none for frame number {number} (the first is number 0)")
-
-
-def _extra_rows(rows: Sequence[Pose], last_number: int, trajectory: Path) -> list[str]:
-    if len(rows) <= last_number + 1:
-        return []
-    return [f"{trajectory}: holds {len(rows)} poses but the last frame is number {last_number}; row i is taken for number i"]
+def _read_poses(numbers: Sequence[int], trajectory: Path) -> tuple[list[Pose], list[str]]:
+    """The pose of every frame number, ascending, and a warning where the trajectory holds more."""
+    rows = read_matrix_rows(trajectory)
+    nothing = f"holds {len(rows)} rows, none for frame number {{}} (the first is number 0)"
+    poses = [rows[number] if number < len(rows) else Pose(str(trajectory), problem=nothing.format(number)) for number in numbers]
+    if len(rows) <= numbers[-1] + 1:
+        return poses, []
+    return poses, [f"{trajectory}: holds {len(rows)} poses but the last frame is number {numbers[-1]}; row i is taken for "
+                   "number i"]
 
 
 def _read_parameters(folder: Path) -> tuple[PinholeCamera, float]:

@@ -19,7 +19,7 @@ from .listing import file_of, first_existing, list_names, numbered_files
 from .poses import parse_numbers, read_lines, read_matrix_file
 from .recording import FrameFiles, Recording, check_depth_scale, depth_size
 from .sens import SensFile
-from .seven_scenes import flat_frames
+from .seven_scenes import flat_frames, no_flat_poses
 
 DEPTH_SCALE = 1000.0
 INTRINSIC_FILES = ("intrinsic/intrinsic_depth.txt", "intrinsic_depth.txt", "intrinsics_depth.txt")  # the last: frames_25k
@@ -48,10 +48,11 @@ def open_scannet(path: Path, *, depth_scale: float | None = None, camera: Pinhol
 def _open_extracted(path: Path, depth_scale: float | None, camera: PinholeCamera | None, drop_alpha: bool) -> Recording:
     depth = numbered_files(path / "depth", r"(\d+)\.png")
     color = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
-    pose = numbered_files(path / "pose", r"(\d+)\.txt")
+    pose = numbered_files(path / "pose", r"(\d+)\.txt") if (path / "pose").is_dir() else {}
     infrared = numbered_files(path / "infrared", r"(\d+)\.png") if (path / "infrared").is_dir() else {}
     frames = [FrameFiles(file_of(number, depth, path / "depth", "{}.png"), file_of(number, color, path / "color", "{}.jpg"),
-                         read_matrix_file(file_of(number, pose, path / "pose", "{}.txt")), infrared=infrared.get(number))
+                         read_matrix_file(file_of(number, pose, path / "pose", "{}.txt")) if pose else None,
+                         infrared=infrared.get(number))
               for number in sorted({*depth, *color, *pose})]
     if not frames:
         raise DatasetError(f"{path}: no color/N.jpg, depth/N.png or pose/N.txt here")
@@ -62,7 +63,8 @@ def _open_extracted(path: Path, depth_scale: float | None, camera: PinholeCamera
             raise DatasetError(f"{path}: no {INTRINSIC_FILES[0]} here; extract the intrinsics too, or pass "
                                "camera=PinholeCamera(...)")
         camera = read_matrix_camera(file, size)
-    return _recording(path, frames, check_size(camera, size, "camera"), depth_scale, drop_alpha)
+    return _recording(path, frames, check_size(camera, size, "camera"), depth_scale, drop_alpha,
+                      "" if pose else f"{path / 'pose'}: no N.txt here")
 
 
 def _open_flat(path: Path, depth_scale: float | None, camera: PinholeCamera | None, drop_alpha: bool) -> Recording:
@@ -78,13 +80,13 @@ def _open_flat(path: Path, depth_scale: float | None, camera: PinholeCamera | No
         camera = make_camera(str(file), size, fx=numbers[0], fy=numbers[5], cx=numbers[2], cy=numbers[6])
     if depth_scale is None and "m_depthShift" in info:
         depth_scale = check_depth_scale(parse_numbers([info["m_depthShift"]], str(file))[0], str(file))
-    return _recording(path, frames, check_size(camera, size, "camera"), depth_scale, drop_alpha)
+    return _recording(path, frames, check_size(camera, size, "camera"), depth_scale, drop_alpha, no_flat_poses(path, frames))
 
 
 def _recording(path: Path, frames: Sequence[FrameFiles], camera: PinholeCamera, depth_scale: float | None,
-               drop_alpha: bool) -> Recording:
+               drop_alpha: bool, no_poses: str) -> Recording:
     return Recording(f"scannet {path}", frames, camera, DEPTH_SCALE if depth_scale is None else depth_scale,
-                     fit_color=True, drop_alpha=drop_alpha)
+                     fit_color=True, drop_alpha=drop_alpha, no_poses=no_poses)
 
 
 def _read_info(file: Path) -> dict[str, str]:

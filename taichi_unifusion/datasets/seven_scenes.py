@@ -32,7 +32,8 @@ def open_seven_scenes(path: Path, *, depth_scale: float | None = None, camera: P
     if not frames:
         raise DatasetError(f"{folder}: no {PATTERN} here")
     return Recording(f"7scenes {folder}", frames, _camera(folder, frames, camera),
-                     DEPTH_SCALE if depth_scale is None else depth_scale, drop_alpha=drop_alpha)
+                     DEPTH_SCALE if depth_scale is None else depth_scale, drop_alpha=drop_alpha,
+                     no_poses=no_flat_poses(folder, frames))
 
 
 def flat_frames(folder: Path, depth_suffix: str = "png") -> list[FrameFiles]:
@@ -42,8 +43,13 @@ def flat_frames(folder: Path, depth_suffix: str = "png") -> list[FrameFiles]:
     pose = numbered_files(folder, r"frame-(\d+)\.pose\.txt")
     return [FrameFiles(file_of(number, depth, folder, "frame-{:06d}.depth.png"),
                        file_of(number, color, folder, "frame-{:06d}.color.png"),
-                       read_matrix_file(file_of(number, pose, folder, "frame-{:06d}.pose.txt")))
+                       read_matrix_file(file_of(number, pose, folder, "frame-{:06d}.pose.txt")) if pose else None)
             for number in sorted({*color, *depth, *pose})]
+
+
+def no_flat_poses(folder: Path, frames: Sequence[FrameFiles]) -> str:
+    """What is missing where none of the flat frames has a pose."""
+    return "" if any(frame.pose for frame in frames) else f"{folder}: no frame-XXXXXX.pose.txt here"
 
 
 def _only_sequence(path: Path) -> Path:

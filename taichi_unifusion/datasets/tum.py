@@ -62,11 +62,13 @@ def open_tum(path: Path, *, depth_scale: float | None = None, camera: PinholeCam
     if any(alone):
         warnings.append(f"{alone[0]} colour and {alone[1]} depth images have no partner within {max_difference} s, left out")
     depth = [depth[i] for i, _ in pairs]
-    poses = _poses_for(depth, path / "groundtruth.txt", max_difference, warnings)
+    truth = path / "groundtruth.txt"
+    poses = _poses_for(depth, truth, max_difference, warnings) if truth.exists() else [None] * len(depth)
     frames = [FrameFiles(image.value, color[j].value, pose, image.timestamp)
               for image, (_, j), pose in zip(depth, pairs, poses, strict=True)]
     return Recording(f"tum {path}", frames, _camera(path, frames, camera, warnings),
-                     DEPTH_SCALE if depth_scale is None else depth_scale, drop_alpha=drop_alpha, warnings=warnings)
+                     DEPTH_SCALE if depth_scale is None else depth_scale, drop_alpha=drop_alpha, warnings=warnings,
+                     no_poses="" if truth.exists() else f"{truth}: no such file")
 
 
 def _read_image_list(file: Path) -> list[Stamped]:
@@ -98,11 +100,8 @@ def _stamps(items: Sequence[Stamped]) -> np.ndarray:
     return np.array([item.timestamp for item in items])
 
 
-def _poses_for(depth: Sequence[Stamped], file: Path, max_difference: float, warnings: list[str]) -> list[Pose | None]:
-    """The ground truth nearest to each depth image, or why there is none; all None where there is no file."""
-    if not file.exists():
-        warnings.append(f"{file}: no such file, so the frames have no poses")
-        return [None] * len(depth)
+def _poses_for(depth: Sequence[Stamped], file: Path, max_difference: float, warnings: list[str]) -> list[Pose]:
+    """The ground truth nearest to each depth image, or why there is none."""
     truth = _in_time_order([Stamped(row.timestamp, row.source, row) for row in read_tum_rows(file)], warnings)
     if not truth:
         raise DatasetError(f"{file}: holds no poses")
