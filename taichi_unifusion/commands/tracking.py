@@ -39,8 +39,8 @@ class TrackingOptions:
     def check_poses(self, frames: Dataset) -> None:
         """Say at once that a recording has no poses where they are needed."""
         if frames.no_poses and self.trajectory is None and self.tracking in ("given", "internal"):
-            raise DatasetError(f"{frames.no_poses}, so the frames have no poses; find them from the frames alone with --tracking "
-                               "rgbd, or take another program's with --tracking external --trajectory FILE")
+            raise DatasetError(f"{frames.no_poses}, so the frames have no poses; find them from the frames alone with "
+                               "--tracking rgbd, or take another program's with --tracking external --trajectory FILE")
 
     def track(self, recording: RecordingOptions, settings: Config, directory: Path,
               stop: Callable[[], bool]) -> tuple[Dataset, dict[str, object]]:

@@ -48,8 +48,9 @@ def open_replica(path: Path, *, depth_scale: float | None = None, camera: Pinhol
 def _read_poses(numbers: Sequence[int], trajectory: Path) -> tuple[list[Pose], list[str]]:
     """The pose of every frame number, ascending, and a warning where the trajectory holds more."""
     rows = read_matrix_rows(trajectory)
-    nothing = f"holds {len(rows)} rows, none for frame number {{}} (the first is number 0)"
-    poses = [rows[number] if number < len(rows) else Pose(str(trajectory), problem=nothing.format(number)) for number in numbers]
+    poses = [rows[number] if number < len(rows) else
+             Pose(str(trajectory), problem=f"holds {len(rows)} rows, none for frame number {number} (the first is number 0)")
+             for number in numbers]
     if len(rows) <= numbers[-1] + 1:
         return poses, []
     return poses, [f"{trajectory}: holds {len(rows)} poses but the last frame is number {numbers[-1]}; row i is taken for "
