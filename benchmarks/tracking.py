@@ -3,23 +3,22 @@
     python benchmarks/tracking.py 7scenes PATH --end 300
     python benchmarks/tracking.py 7scenes PATH --end 300 --methods ours ours-no-loops ours-geometry
     python benchmarks/tracking.py synthetic --methods ours ours-no-loops
-    python benchmarks/tracking.py house-living PATH/aws-small-house --methods ours ours-no-loops
+    python benchmarks/tracking.py house-tour PATH/aws-small-house --methods ours ours-no-loops --every 5
     python benchmarks/tracking.py tum PATH/rgbd_dataset_freiburg1_desk
     python benchmarks/tracking.py 7scenes PATH --end 300 --refine 100      # a pair of frames, disturbed so many times
 
 ATE is the RMSE of camera positions after the best rigid motion, RPE that of the motion from frame to frame, both against the
 recording's poses; "end" is how far the last camera is off, seen from the first. "agree" needs no truth: the share of what
 frames ten apart see in common that lies within 4 cm at these poses, with normals within 25 degrees. Times are process CPU time of
-all threads, loading left out: a busy machine changes them less than others.
-Open3D and OpenCV get the same frames and intrinsics, and their own defaults.
+all threads, after a warm-up, reading of frames left out; "mean" holds keyframes, loops and the final optimisation. The methods
+take the frames turn by turn. Open3D and OpenCV get the same frames and intrinsics, and their own defaults.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -29,7 +28,7 @@ import taichi_unifusion as uf
 from taichi_unifusion.evaluation.trajectory import evaluate_trajectory
 from taichi_unifusion.terminal import format_table
 from taichi_unifusion.tracking import TrackingSettings, se3
-from taichi_unifusion.tracking.pyramid import build_pyramid, reduce_frame
+from taichi_unifusion.tracking.pyramid import SurfelPyramid, build_pyramid, reduce_frame
 from taichi_unifusion.tracking.registration import evaluate, register
 from taichi_unifusion.tracking.rgbd import RgbdTracker
 from taichi_unifusion.types import Trajectory
@@ -38,6 +37,8 @@ DEPTH_RANGE = 0.1, 6.0
 PAIRED = 10                          # frames apart that are compared by "agree"
 DISTURBANCE = 0.03, np.radians(2.0)  # [m, rad] at most
 BACK = 0.003, np.radians(0.2)        # what counts as found back
+WARM_UP = 3                          # frames
+HEADER = ["method", "tracked", "ATE cm", "end cm", "RPE cm", "agree %", "median ms", "mean ms"]
 
 
 class Ours:
@@ -73,73 +74,96 @@ def agreement(pyramids: dict, poses: dict[int, np.ndarray]) -> str:
     return f"{100 * np.mean(shares):.1f}" if shares else "-"
 
 
-def run(name: str, frames, truth: dict, pyramids: dict) -> list[str]:
-    """One row of the table; fills the given poses and every tenth frame's pyramid when it is the first."""
-    method, laps = None, []
-    for i, frame in enumerate(frames):
-        method = method or METHODS[name](frame.camera)
-        truth[frame.index] = frame.T_world_camera
-        if i % PAIRED == 0 and frame.index not in pyramids:
-            pyramids[frame.index] = build_pyramid(reduce_frame(frame, *DEPTH_RANGE))
+class Run:
+    """One method on its way through the frames: one row of the table."""
+
+    def __init__(self, name: str, camera: uf.PinholeCamera) -> None:
+        self.name, self.method, self.laps = name, METHODS[name](camera), []
+
+    def track(self, frame: uf.Frame) -> None:
         start = time.process_time()
-        method.track(frame)
-        laps.append(1e3 * (time.process_time() - start))
-    start = time.process_time()
-    poses = method.finish()
-    finish = 1e3 * (time.process_time() - start)
-    found = [index for index in poses if truth[index] is not None]
-    if len(found) < 3:
-        return [name, f"{len(poses)} of {len(truth)}", *["-"] * 6]
-    estimate, given = (Trajectory(np.array(found, float), np.array([source[i] for i in found])) for source in (poses, truth))
-    result = evaluate_trajectory(estimate, given)
-    last = se3.distance(se3.inverse(poses[found[0]]) @ poses[found[-1]], se3.inverse(truth[found[0]]) @ truth[found[-1]])
-    return [name, f"{len(poses)} of {len(truth)}", f"{result.ate_cm.rmse:.2f}", f"{100 * last[0]:.2f}",
-            f"{result.rpe_translation_cm.rmse:.2f}", agreement(pyramids, poses), f"{np.median(laps):.0f}",
-            f"{(sum(laps[1:]) + finish) / max(len(laps) - 1, 1):.0f}"]
+        self.method.track(frame)
+        self.laps.append(1e3 * (time.process_time() - start))
+
+    def row(self, truth: dict, pyramids: dict) -> list[str]:
+        start = time.process_time()
+        poses = self.method.finish()
+        total = sum(self.laps) + 1e3 * (time.process_time() - start)
+        counted = [self.name, f"{len(poses)} of {len(truth)}"]
+        times = [f"{np.median(self.laps):.0f}", f"{total / len(self.laps):.0f}"]
+        found = [index for index in poses if truth[index] is not None]
+        if len(found) < 3:
+            return [*counted, *["-"] * 4, *times]
+        estimate, given = (np.array([source[index] for index in found]) for source in (poses, truth))
+        result = evaluate_trajectory(*(Trajectory(np.array(found, float), T) for T in (estimate, given)))
+        last, _ = se3.distance(*(se3.inverse(T[0]) @ T[-1] for T in (estimate, given)))
+        return [*counted, f"{result.ate_cm.rmse:.2f}", f"{100 * last:.2f}", f"{result.rpe_translation_cm.rmse:.2f}",
+                agreement(pyramids, poses), *times]
 
 
-def refine(frames, trials: int, apart: int) -> str:
+def compare(names: Sequence[str], frames: uf.datasets.Dataset) -> list[list[str]]:
+    """Rows of all methods and of the given poses; they take the frames turn by turn, so that their times compare."""
+    warm_up(names, frames[:WARM_UP])
+    runs, truth, pyramids = [Run(name, frames[0].camera) for name in names], {}, {}
+    for i, frame in enumerate(frames):
+        truth[frame.index] = frame.T_world_camera
+        if i % PAIRED == 0:
+            pyramids[frame.index] = pyramid(frame)
+        for run in runs:
+            run.track(frame)
+    given = ["given poses", f"{len(truth)} of {len(truth)}", *["-"] * 3, agreement(pyramids, truth), "-", "-"]
+    return [*(run.row(truth, pyramids) for run in runs), given]
+
+
+def warm_up(names: Sequence[str], frames: uf.datasets.Dataset) -> None:
+    """Load kernels and libraries, as happens once a process, before times are taken."""
+    runs = [Run(name, frames[0].camera) for name in names]
+    for frame in frames:
+        for run in runs:
+            run.track(frame)
+    for run in runs:
+        run.method.finish()
+
+
+def pyramid(frame: uf.Frame) -> SurfelPyramid:
+    return build_pyramid(reduce_frame(frame, *DEPTH_RANGE))
+
+
+def disturbance(rng: np.random.Generator) -> np.ndarray:
+    """A motion in any direction, of any size up to DISTURBANCE."""
+    twist = rng.normal(size=6)
+    length = np.repeat([np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])], 3)
+    return se3.exp(twist / length * np.repeat(rng.uniform(0, 1, 2) * DISTURBANCE, 3))
+
+
+def refine(frames: uf.datasets.Dataset, trials: int, apart: int) -> str:
     """Pairs of frames from known disturbances: how often, how near and how fast they come back to where they came from."""
-    from taichi_unifusion.tracking.pyramid import SurfelPyramid
-
-    def pyramid(frame: uf.Frame) -> SurfelPyramid:
-        return build_pyramid(reduce_frame(frame, *DEPTH_RANGE))
-
-    rng, rows = np.random.default_rng(0), []
-    starts = rng.integers(0, len(frames) - apart, trials)
-    pairs, back, errors, times, theirs = {}, 0, [], [], []
-    for trial, start in enumerate(starts):
-        if start not in pairs:
-            a, b = frames[int(start)], frames[int(start) + apart]
-            T = se3.inverse(a.T_world_camera) @ b.T_world_camera
-            pairs[start] = a, b, pyramid(a), pyramid(b), register(pyramid(b), pyramid(a), T).T_target_source
-        a, b, first, second, optimum = pairs[start]
-        twist = rng.normal(size=6)
-        size = np.repeat(rng.uniform(0, 1, 2) * DISTURBANCE, 3)
-        twist *= size / np.repeat([np.linalg.norm(twist[:3]), np.linalg.norm(twist[3:])], 3)
-        guess = se3.exp(twist) @ optimum
+    rng = np.random.default_rng(0)
+    errors, times, pyramid_times, their_times = [], [], [], []
+    for trial, start in enumerate(rng.integers(0, len(frames) - apart, trials)):
+        a, b = frames[int(start)], frames[int(start) + apart]
         began = time.process_time()
-        found = register(second, first, guess)
-        times.append(1e3 * (time.process_time() - began))
-        error = se3.distance(found.T_target_source, optimum)
-        back += error[0] < BACK[0] and error[1] < BACK[1]
-        errors.append((1e3 * error[0], np.degrees(error[1])))
+        first, second = pyramid(a), pyramid(b)
+        pyramid_times.append(time.process_time() - began)
+        optimum = register(second, first, se3.inverse(a.T_world_camera) @ b.T_world_camera).T_target_source
+        guess = disturbance(rng) @ optimum
+        began = time.process_time()
+        found = register(second, first, guess).T_target_source
+        times.append(time.process_time() - began)
+        errors.append(se3.distance(found, optimum))
         if trial % 10 == 1:  # a few are enough for the ratio of times: turn by turn, in the same run
-            cloud = time.process_time()
-            pyramid(a), pyramid(b)
-            middle = time.process_time()
+            began = time.process_time()
             with suppress(RuntimeError):  # it raises where it finds no correspondence
                 peers.colored_icp(a, b, guess)
-            theirs.append((1e3 * (middle - cloud), 1e3 * (time.process_time() - middle)))
-    errors, theirs = np.array(errors), np.array(theirs)
-    both = np.median(times) + np.median(theirs[:, 0])
-    rows = [["what", "value"], ["found back", f"{back} of {trials}"],
-            ["median error", f"{np.median(errors[:, 0]):.2f} mm, {np.median(errors[:, 1]):.3f} degrees"],
-            ["largest error", f"{errors[:, 0].max():.2f} mm, {errors[:, 1].max():.3f} degrees"],
-            ["alignment", f"{np.median(times):.0f} ms"], ["with both pyramids", f"{both:.0f} ms"],
-            ["Open3D colored ICP, 3 scales",
-             f"{np.median(theirs[:, 1]):.0f} ms, {np.median(theirs[:, 1]) / both:.1f} times as long"]]
-    return format_table(rows)
+            their_times.append(time.process_time() - began)
+    errors, (ours, pyramids, theirs) = np.array(errors), (1e3 * np.median(t) for t in (times, pyramid_times, their_times))
+    back = int((errors < BACK).all(axis=1).sum())
+    shown = [f"{1e3 * distance:.2f} mm, {np.degrees(angle):.3f} degrees"
+             for distance, angle in (np.median(errors, axis=0), errors.max(axis=0))]
+    return format_table([["what", "value"], ["found back", f"{back} of {trials}"], ["median error", shown[0]],
+                         ["largest error", shown[1]], ["alignment", f"{ours:.0f} ms"],
+                         ["with both pyramids", f"{ours + pyramids:.0f} ms"],
+                         ["Open3D colored ICP, 3 scales", f"{theirs:.0f} ms, {theirs / (ours + pyramids):.1f} times as long"]])
 
 
 def open_frames(format: str, path: str | None) -> uf.datasets.Dataset:
@@ -167,13 +191,7 @@ def main() -> None:
     if options.refine:
         print(refine(frames, options.refine, options.apart))
         return
-    header, truth, pyramids = ["method", "tracked", "ATE cm", "end cm", "RPE cm", "agree %", "median ms", "mean ms"], {}, {}
-    rows = []
-    for name in options.methods:
-        rows.append(run(name, frames, truth, pyramids))
-        print(*rows[-1], sep="  ", file=sys.stderr, flush=True)
-    given = ["given poses", f"{len(truth)} of {len(truth)}", "-", "-", "-", agreement(pyramids, truth), "-", "-"]
-    print(format_table([header, *rows, given]))
+    print(format_table([HEADER, *compare(options.methods, frames)]))
 
 
 if __name__ == "__main__":

@@ -200,6 +200,15 @@ def test_a_flat_wall_fixes_nothing_along_it():
     assert register(flat, flat, np.eye(4)).weakest > 1.0
 
 
+def test_uncertainty_is_that_of_the_scene_and_not_of_the_number_of_pixels():
+    weakest = []
+    for width in (160, 320, 640):
+        frames = SyntheticRoom(frames=60, width=width, height=3 * width // 4, noise=False)
+        first, second = pyramid(frames[0]), pyramid(frames[1])
+        weakest.append(register(second, first, np.eye(4)).weakest)
+    assert max(weakest) < 1.5 * min(weakest)
+
+
 def test_a_frame_without_colour_is_aligned_by_its_geometry(room, pair):
     _, _, truth = pair
     first, second = (pyramid(replace(room[i], color=None)) for i in (0, 1))

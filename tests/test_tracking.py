@@ -166,6 +166,14 @@ def test_some_frames_without_colour_do_no_harm(walk):
     assert verdicts(result) == ["tracked"] * 8 and errors(result, walk).max() < 2 * ATE
 
 
+@pytest.mark.parametrize(("width", "loop"), [(160, 120), (160, 24)])
+def test_small_images_are_tracked_at_small_and_large_steps(width, loop):
+    room = SyntheticRoom(frames=loop, width=width, height=3 * width // 4)  # steps of 4 cm and 3 degrees; 21 cm and 13 degrees
+    frames = [room[i] for i in range(8)]
+    result = track_sequence(Listed([bare(frame) for frame in frames]), RgbdTracker())
+    assert verdicts(result) == ["tracked"] * 8 and errors(result, frames).max() < 2 * ATE
+
+
 def test_a_stop_keeps_what_was_tracked(walk):
     seen = []
     result = track_sequence(Listed(walk), RgbdTracker(), stop=lambda: len(seen) == 3, on_frame=lambda *done: seen.append(done))
@@ -183,6 +191,15 @@ def test_features_recognise_a_place_and_say_where_it_is(walk):
     distance, angle = se3.distance(found, se3.inverse(walk[0].T_world_camera) @ walk[3].T_world_camera)
     assert distance < 0.15 and np.degrees(angle) < 6  # where alignment takes over
     assert locate(features[1], features[0]) is None
+
+
+def test_features_of_a_small_image_say_the_same():
+    room = SyntheticRoom(frames=120, width=160, height=120)
+    first, second = (extract_features(room[i], 0.3, 6.0) for i in (0, 3))
+    distance, angle = se3.distance(locate(second, first), se3.inverse(room[0].T_world_camera) @ room[3].T_world_camera)
+    assert distance < 0.15 and np.degrees(angle) < 6
+    seen = first.points[:, :2] / first.points[:, 2:] * first.K[[0, 1], [0, 1]] + first.K[:2, 2]
+    np.testing.assert_allclose(seen, first.pixels, atol=1e-3)
 
 
 def test_features_of_a_frame_without_colour_or_texture_are_none(walk):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..types import Frame
 
 FEATURES = 800
+LEAST_WIDTH = 320      # [px] smaller images are enlarged: a corner's surroundings are 31 pixels wide
 RATIO = 0.8            # best against second-best distance of a match
 REPROJECTION = 6.0     # [px] of a match that supports a pose
 MIN_MATCHES = 12       # that support a pose
@@ -21,7 +22,7 @@ QUERY_FEATURES, STORED_FEATURES = 200, 300  # of the strongest, that vote for si
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Corners of a frame that have a depth, strongest first."""
+    """Corners of a frame that have a depth, strongest first; pixels are those of the image that they were found in."""
 
     descriptors: NDArray[np.uint8]  # (N, 32)
     pixels: NDArray[np.float32]     # (N, 2) u, v
@@ -35,23 +36,28 @@ class Features:
 def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Features:
     """ORB features of a frame at pixels with a reading in range; none where it has no colour."""
     camera = frame.camera
-    empty = Features(np.empty((0, 32), np.uint8), np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), camera.matrix)
+    scale = -(-LEAST_WIDTH // camera.width)
+    K = np.array([[scale * camera.fx, 0, scale * (camera.cx + 0.5) - 0.5], [0, scale * camera.fy, scale * (camera.cy + 0.5) - 0.5],
+                  [0, 0, 1]])
+    empty = Features(np.empty((0, 32), np.uint8), np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), K)
     if frame.color is None:
         return empty
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+    if scale > 1:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     corners, descriptors = cv2.ORB_create(FEATURES, fastThreshold=10).detectAndCompute(gray, None)
     if not corners:
         return empty
     pixels = np.array([corner.pt for corner in corners], np.float32)
-    at = np.rint(pixels).astype(int).clip(0, (camera.width - 1, camera.height - 1))
+    at = np.rint((pixels + 0.5) / scale - 0.5).astype(int).clip(0, (camera.width - 1, camera.height - 1))
     z = frame.depth[at[:, 1], at[:, 0]]
     with np.errstate(invalid="ignore"):
         seen = np.isfinite(z) & (z >= depth_min) & (z <= depth_max)
     order = np.argsort([-corner.response for corner in corners], kind="stable")
     order = order[seen[order]]
-    rays = (pixels[order] - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    rays = (pixels[order] - K[:2, 2]) / K[[0, 1], [0, 1]]
     points = np.column_stack([rays, np.ones(len(order))]) * z[order, None]
-    return Features(descriptors[order], pixels[order], points.astype(np.float32), camera.matrix)
+    return Features(descriptors[order], pixels[order], points.astype(np.float32), K)
 
 
 def most_similar(query: Features, others: Sequence[Features], count: int) -> list[int]:

@@ -14,7 +14,7 @@ from ..types import Frame, PinholeCamera
 FINEST_WIDTH = 320         # [px] at least; finer images add time and noise, no accuracy
 SMALLEST = 24              # [px] shorter side of the coarsest level
 NORMAL_RADIUS = (3, 2, 2)  # [px] by level, finest first
-EDGE_JUMP = 0.03           # of the depth between pixels of one surface, doubled from level to level
+EDGE_JUMP = 0.03           # of the depth between pixels of one surface, in an image of FINEST_WIDTH or more
 EDGE_SUPPORT = 5           # as in preprocessing
 MAX_ANGLE = 80.0           # [degrees] between ray and normal
 
@@ -54,11 +54,12 @@ def reduce_frame(frame: Frame, depth_min: float, depth_max: float) -> ReducedFra
     depth = np.ascontiguousarray(frame.depth)
     clipped, inverse = np.empty_like(depth), np.empty_like(depth)
     images.clip_depth(depth, depth_min, depth_max, clipped)
-    images.drop_flying_pixels(clipped, EDGE_JUMP, EDGE_SUPPORT, inverse)
+    jump = edge_jump(frame.camera)
+    images.drop_flying_pixels(clipped, jump, EDGE_SUPPORT, inverse)
     factor = max(1, frame.camera.width // FINEST_WIDTH)
     camera = shrunk(frame.camera, factor)
     reduced, intensity = (np.zeros((camera.height, camera.width), np.float32) for _ in range(2))
-    kernels.average_inverse_depth(inverse, factor, EDGE_JUMP, reduced)
+    kernels.average_inverse_depth(inverse, factor, jump, reduced)
     if frame.color is not None:
         kernels.average_color(np.ascontiguousarray(frame.color), factor, intensity)
     return ReducedFrame(reduced, intensity.astype(np.float16), camera, frame.color is not None)
@@ -75,21 +76,25 @@ def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
     cosine = float(np.cos(np.radians(MAX_ANGLE)))
     levels = []
     for level, radius in enumerate(NORMAL_RADIUS):
-        jump = EDGE_JUMP * 2**level
         if level:
             if min(camera.size) < 2 * SMALLEST:
                 break
             camera = shrunk(camera, 2)
             finer, finer_intensity = inverse, intensity
             inverse, intensity = (np.empty((camera.height, camera.width), np.float32) for _ in range(2))
-            kernels.average_inverse_depth(finer, 2, jump, inverse)
+            kernels.average_inverse_depth(finer, 2, edge_jump(camera), inverse)
             kernels.average_intensity(finer_intensity, intensity)
         normals = np.empty((*inverse.shape, 3), np.float32)
-        images.estimate_normals(inverse, camera.fx, camera.fy, camera.cx, camera.cy, radius, jump, cosine, normals)
+        images.estimate_normals(inverse, camera.fx, camera.fy, camera.cx, camera.cy, radius, edge_jump(camera), cosine, normals)
         surfels = ti.ndarray(ti.f32, (*inverse.shape, kernels.CHANNELS))
         kernels.pack_surfels(inverse, normals, intensity, surfels)
         levels.append(SurfelImage(surfels, camera))
     return SurfelPyramid(tuple(levels), reduced.colored)
+
+
+def edge_jump(camera: PinholeCamera) -> float:
+    """By which share of the depth neighbouring pixels of one surface may differ: the more, the fewer pixels see it."""
+    return EDGE_JUMP * max(1.0, FINEST_WIDTH / camera.width)
 
 
 def shrunk(camera: PinholeCamera, factor: int) -> PinholeCamera:

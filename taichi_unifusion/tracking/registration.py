@@ -13,13 +13,13 @@ from .pyramid import SurfelPyramid
 
 ITERATIONS = (8, 10, 12)      # at most, by level, finest first
 GATES = (0.04, 0.08, 0.16)    # [m] farthest distance of an inlier from the other's plane
-STEPS = (2, 1, 1)             # every so manieth pixel of every so manieth row of the source is used
+USED_WIDTH = 160              # pixels of the source in a row that are used of a wider image, at least
 MAX_ANGLE = 25.0              # [degrees] between the normals of inliers
 ROBUST_WIDTH = 1.0            # [standard deviations] a distance that counts half
 CONVERGED = 1e-4              # [m, rad] a step below it ends a level
 FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.005  # of intensities in [0, 1]
 DAMPING = 1e-9                # of the mean diagonal: keeps a blind direction solvable
-CORRELATION = 100.0           # neighbouring pixels err alike: so many of those used count as one
+INDEPENDENT = 192.0           # neighbouring pixels err alike: an image counts as so many measurements, however many it has
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,7 @@ class _Equations:
     b: NDArray[np.float64]  # (6,)
     counts: NDArray[np.float64]
     sigma: float            # of intensity residuals
+    pixels: float           # of the source that were used, whether they have a reading or not
 
 
 def _sum(source: SurfelPyramid, targets: Sequence[Target], T_reference_source: NDArray, level: int, sigma: float,
@@ -98,14 +99,15 @@ def _sum(source: SurfelPyramid, targets: Sequence[Target], T_reference_source: N
     H, b, counts = np.zeros((6, 6)), np.zeros(6), np.zeros(kernels.SUMS)
     limits = np.array([GATES[level], np.cos(np.radians(MAX_ANGLE)), ROBUST_WIDTH, sigma, weight], np.float32)
     image = source.levels[level]
+    step = max(1, image.camera.width // USED_WIDTH)  # every so manieth pixel of every so manieth row
     for target in targets:
         limits[4] = weight if source.colored and target.pyramid.colored else 0.0
         other = target.pyramid.levels[level]
         intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in (image.camera, other.camera)], np.float32)
         T = np.ascontiguousarray((target.T_target_reference @ T_reference_source)[:3], np.float32)
-        rows = -(-image.camera.height // STEPS[level])
+        rows = -(-image.camera.height // step)
         sums = np.empty((-(-rows // kernels.BLOCK_ROWS), kernels.SUMS), np.float32)
-        kernels.sum_normal_equations(image.surfels, other.surfels, intrinsics, T, STEPS[level], limits, sums)
+        kernels.sum_normal_equations(image.surfels, other.surfels, intrinsics, T, step, limits, sums)
         total = sums.sum(axis=0, dtype=np.float64)
         A = se3.adjoint(target.T_target_reference)
         H += A.T @ _symmetric(total[:kernels.H_SIZE]) @ A
@@ -113,7 +115,7 @@ def _sum(source: SurfelPyramid, targets: Sequence[Target], T_reference_source: N
         counts += total
     if counts[kernels.COLORED] > 0:
         sigma = max(float(np.sqrt(counts[kernels.PHOTOMETRIC_SCALE] / counts[kernels.COLORED])), LEAST_SIGMA)
-    return _Equations(H, b, counts, sigma)
+    return _Equations(H, b, counts, sigma, image.camera.width * image.camera.height / step**2)
 
 
 def _result(T: NDArray, equations: _Equations) -> Registration:
@@ -122,7 +124,7 @@ def _result(T: NDArray, equations: _Equations) -> Registration:
     of, inliers = max(equations.counts[kernels.SOURCE], 1.0), equations.counts[kernels.INLIERS]
     rmse = float(np.sqrt(equations.counts[kernels.SQUARED_DISTANCE] / inliers)) if inliers else float("inf")
     return Registration(np.asarray(T, np.float64), inliers / of, rmse, equations.counts[kernels.IN_VIEW] / of,
-                        equations.H / CORRELATION)
+                        equations.H * (INDEPENDENT / equations.pixels))
 
 
 def _symmetric(upper: NDArray) -> NDArray[np.float64]:
