@@ -20,6 +20,7 @@ import argparse
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from itertools import pairwise
 
 import numpy as np
 import tracking_peers as peers
@@ -35,6 +36,7 @@ from taichi_unifusion.types import Trajectory
 
 DEPTH_RANGE = 0.1, 6.0
 PAIRED = 10                          # frames apart that are compared by "agree"
+COMMON = 0.25                        # share of a frame that must be seen by both
 DISTURBANCE = 0.03, np.radians(2.0)  # [m, rad] at most
 BACK = 0.003, np.radians(0.2)        # what counts as found back
 WARM_UP = 3                          # frames
@@ -69,8 +71,8 @@ METHODS: dict[str, Callable[[uf.PinholeCamera], object]] = {
 def agreement(pyramids: dict, poses: dict[int, np.ndarray]) -> str:
     """Share of what two frames see in common that lies within 4 cm, frames a few apart: says of poses how well depths agree."""
     kept = [index for index in pyramids if poses.get(index) is not None]
-    shares = [evaluate(pyramids[b], pyramids[a], se3.inverse(poses[a]) @ poses[b]).agreement
-              for a, b in zip(kept, kept[1:], strict=False)]
+    found = [evaluate(pyramids[b], pyramids[a], se3.inverse(poses[a]) @ poses[b]) for a, b in pairwise(kept)]
+    shares = [pair.agreement for pair in found if pair.overlap > COMMON]
     return f"{100 * np.mean(shares):.1f}" if shares else "-"
 
 

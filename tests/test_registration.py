@@ -141,7 +141,7 @@ def test_registration_finds_the_true_pose(pair):
     found = register(second, first, np.eye(4))
     distance, angle = apart(found.T_target_source, truth)
     assert distance < EXACT_MM and angle < EXACT_DEGREES
-    assert found.agreement > 0.9 and found.rmse < 0.02 and found.weakest < 0.01
+    assert found.agreement > 0.9 and found.rmse < 0.02 and found.determined
 
 
 def test_registration_is_the_same_bit_for_bit(pair):
@@ -197,7 +197,19 @@ def test_a_flat_wall_fixes_nothing_along_it():
     surfel_image = ti.ndarray(ti.f32, wall.shape)
     surfel_image.from_numpy(wall)
     flat = SurfelPyramid((SurfelImage(surfel_image, camera),))
-    assert register(flat, flat, np.eye(4)).weakest > 1.0
+    found = register(flat, flat, np.eye(4))
+    assert found.uncertainty[-1] > 1.0 and not found.determined
+
+
+@pytest.mark.parametrize("distance", [1.0, 2.0, 3.5])
+def test_a_blank_wall_does_not_tell_where_the_camera_is(room, distance):
+    rng, frame = np.random.default_rng(0), room[0]
+    sigma = np.sqrt(reference.axial_variance(distance))
+    walls = [replace(frame, depth=(distance + rng.normal(0, sigma, frame.depth.shape)).astype(np.float32),
+                     color=rng.normal(200, 2, frame.color.shape).astype(np.uint8)) for _ in range(2)]
+    first, second = (pyramid(wall) for wall in walls)
+    found = register(second, first, np.eye(4))
+    assert found.agreement > 0.9 and not found.determined  # it fits, anywhere along the wall
 
 
 def test_uncertainty_is_that_of_the_scene_and_not_of_the_number_of_pixels():
@@ -205,7 +217,7 @@ def test_uncertainty_is_that_of_the_scene_and_not_of_the_number_of_pixels():
     for width in (160, 320, 640):
         frames = SyntheticRoom(frames=60, width=width, height=3 * width // 4, noise=False)
         first, second = pyramid(frames[0]), pyramid(frames[1])
-        weakest.append(register(second, first, np.eye(4)).weakest)
+        weakest.append(register(second, first, np.eye(4)).uncertainty[-1])
     assert max(weakest) < 1.5 * min(weakest)
 
 

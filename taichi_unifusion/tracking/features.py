@@ -37,8 +37,8 @@ def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Featur
     """ORB features of a frame at pixels with a reading in range; none where it has no colour."""
     camera = frame.camera
     scale = -(-LEAST_WIDTH // camera.width)
-    K = np.array([[scale * camera.fx, 0, scale * (camera.cx + 0.5) - 0.5], [0, scale * camera.fy, scale * (camera.cy + 0.5) - 0.5],
-                  [0, 0, 1]])
+    cx, cy = scale * (camera.cx + 0.5) - 0.5, scale * (camera.cy + 0.5) - 0.5
+    K = np.array([[scale * camera.fx, 0, cx], [0, scale * camera.fy, cy], [0, 0, 1]])
     empty = Features(np.empty((0, 32), np.uint8), np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), K)
     if frame.color is None:
         return empty

@@ -16,8 +16,7 @@ NEIGHBORS = 2        # of them, so many are aligned beside the one before
 LOOPS = 2            # older keyframes that are aligned at most, by place and by appearance each
 MIN_OVERLAP = 0.3    # of a pair that is worth aligning
 LOOP_OVERLAP, LOOP_AGREEMENT = 0.25, 0.75  # of a pair that is believed; stricter than from frame to frame
-MAX_UNCERTAINTY = 0.02  # [m] in the weakest direction
-MAX_CORRECTION = 0.3, np.radians(15)       # [m, rad] by which alignment may move what features found
+MAX_CORRECTION = 0.3, np.radians(15)  # [m, rad] by which alignment may move what features found
 
 
 def neighbor_edges(keyframes: Keyframes, number: int, photometric_weight: float) -> list[Edge]:
@@ -29,13 +28,13 @@ def neighbor_edges(keyframes: Keyframes, number: int, photometric_weight: float)
 def find_loops(keyframes: Keyframes, number: int, photometric_weight: float, by_appearance: bool) -> list[Edge]:
     """A keyframe aligned to older ones: to those that it should see if its pose is right, and to those that look like it."""
     older = range(max(0, number - NEAR))
-    candidates: list[tuple[int, NDArray | None]] = [(other, None) for other in _by_overlap(keyframes, number, older)[:LOOPS]]
-    edges = [edge for other, guess in candidates if (edge := _edge(keyframes, other, number, photometric_weight, guess, True))]
+    edges = [edge for other in _by_overlap(keyframes, number, older)[:LOOPS]
+             if (edge := _edge(keyframes, other, number, photometric_weight, None, loop=True))]
     if by_appearance and not edges:
         features = keyframes.items[number].features
         for other in most_similar(features, [keyframes.items[k].features for k in older], LOOPS):
             guess = locate(features, keyframes.items[other].features)
-            if guess is not None and (edge := _edge(keyframes, other, number, photometric_weight, guess, True)):
+            if guess is not None and (edge := _edge(keyframes, other, number, photometric_weight, guess, loop=True)):
                 edges.append(edge)
     return edges
 
@@ -63,5 +62,5 @@ def _edge(keyframes: Keyframes, other: int, number: int, photometric_weight: flo
 def believable(found: Registration, guess: NDArray) -> bool:
     """Whether two keyframes really see the same from there."""
     distance, angle = se3.distance(guess, found.T_target_source)
-    return (found.overlap > LOOP_OVERLAP and found.agreement > LOOP_AGREEMENT and found.weakest < MAX_UNCERTAINTY
+    return (found.overlap > LOOP_OVERLAP and found.agreement > LOOP_AGREEMENT and found.determined
             and distance < MAX_CORRECTION[0] and angle < MAX_CORRECTION[1])

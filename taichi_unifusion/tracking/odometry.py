@@ -23,7 +23,6 @@ MIN_SURFELS = 0.03      # share of the image
 MIN_OVERLAP = 0.25
 MIN_AGREEMENT = 0.65    # of what is in view; right alignments leave 0.84 to 0.98
 SURE_AGREEMENT = 0.8    # where nobody knows how far the camera went
-MAX_UNCERTAINTY = 0.015  # [m] of the translation in its weakest direction; rooms leave 0.002 to 0.008
 MAX_CORRECTION = 0.3, np.radians(20)  # [m, rad] farther from the guess alignment only goes astray
 
 
@@ -163,7 +162,7 @@ def problem_of(found: Registration, guess: NDArray, agreement: float = MIN_AGREE
         return f"only {found.overlap:.0%} of the frame overlaps its keyframe"
     if found.agreement < agreement:
         return f"only {found.agreement:.0%} of the overlap lies on the surface that was seen before"
-    if found.weakest > MAX_UNCERTAINTY:
+    if not found.determined:
         return "what the frame sees does not tell where the camera is (a blank wall?)"
     if distance > MAX_CORRECTION[0] or angle > MAX_CORRECTION[1]:
         return f"alignment went astray ({distance:.2f} m, {np.degrees(angle):.0f} degrees from where the camera was expected)"

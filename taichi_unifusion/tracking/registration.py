@@ -19,6 +19,8 @@ ROBUST_WIDTH = 1.0            # [standard deviations] a distance that counts hal
 CONVERGED = 1e-4              # [m, rad] a step below it ends a level
 FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.005  # of intensities in [0, 1]
 DAMPING = 1e-9                # of the mean diagonal: keeps a blind direction solvable
+MAX_UNCERTAINTY = 0.05        # [m] of the translation in its weakest direction
+MAX_AMBIGUITY = 10.0          # of it to that in its best direction; rooms leave 2 to 6, blank walls 14 to 66
 INDEPENDENT = 192.0           # neighbouring pixels err alike: an image counts as so many measurements, however many it has
 
 
@@ -38,13 +40,19 @@ class Registration:
         return self.fitness / self.overlap if self.overlap > 0 else 0.0
 
     @property
-    def weakest(self) -> float:
-        """Standard deviation of the translation in its most uncertain direction [m]; infinite where nothing fixes it."""
+    def uncertainty(self) -> NDArray[np.float64]:
+        """Standard deviations (3,) [m] of the translation along its principal axes, best first; infinite where it is open."""
         values, vectors = np.linalg.eigh(self.information)
         if values[0] <= 0:
-            return float("inf")
+            return np.full(3, np.inf)
         covariance = (vectors / values) @ vectors.T
-        return float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        return np.sqrt(np.linalg.eigvalsh(covariance[:3, :3]))
+
+    @property
+    def determined(self) -> bool:
+        """Whether what is seen tells where the camera is; along a blank wall only the noise of its normals does."""
+        best, _, weakest = self.uncertainty
+        return bool(weakest < MAX_UNCERTAINTY and weakest < MAX_AMBIGUITY * best)
 
 
 @dataclass(frozen=True, eq=False)
