@@ -16,10 +16,12 @@ import house  # noqa: E402
 import properties_flicker  # noqa: E402
 import quality  # noqa: E402
 import quality_pictures  # noqa: E402
+import tracking  # noqa: E402
 from quality_methods import METHODS, method  # noqa: E402
 from quality_scenes import split  # noqa: E402
 
 from taichi_unifusion import Frame, PinholeCamera  # noqa: E402
+from taichi_unifusion.datasets.synthetic import SyntheticRoom  # noqa: E402
 from taichi_unifusion.errors import InputError  # noqa: E402
 
 SMOOTH = 0.5         # share by which the motion may change from one frame to the next
@@ -124,3 +126,14 @@ def test_flicker_is_the_change_at_the_same_points(tmp_path):
     assert np.isnan(change[:, 20:30]).all() and np.isnan(change[:, :3]).all() and np.isfinite(change[:, 40:60]).all()
     properties_flicker.write_sheet(tmp_path / "sheet.jpg", views, "style")
     assert cv2.imread(str(tmp_path / "sheet.jpg")).shape == (3 * 216, 5 * 288, 3)
+
+
+def test_the_table_of_trackers_has_a_row_a_method_and_tells_good_poses_from_bad_ones():
+    frames = SyntheticRoom(frames=240, width=160, height=120)[:11]
+    ours, given = tracking.compare(["ours"], frames)
+    assert ours[:2] == ["ours", "11 of 11"] and given[:2] == ["given poses", "11 of 11"]
+    assert 0 < float(ours[2]) < 1 and len(ours) == len(given) == len(tracking.HEADER)
+    truth = {frame.index: frame.T_world_camera for frame in frames}
+    pyramids = {index: tracking.pyramid(frames[index]) for index in (0, 10)}
+    still = dict.fromkeys(truth, truth[0])
+    assert float(tracking.agreement(pyramids, truth)) > float(tracking.agreement(pyramids, still)) + 20

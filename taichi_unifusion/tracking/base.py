@@ -24,7 +24,7 @@ class Verdict(StrEnum):
     GIVEN = "given"                # as read, not touched
     INTERPOLATED = "interpolated"  # between two poses as read
     TRACKED = "tracked"            # aligned to earlier frames
-    RELOCALISED = "relocalised"    # found again by features after tracking was lost
+    RELOCALISED = "relocalised"    # found by its features at a keyframe, which need not be the last one
     REFINED = "refined"            # aligned to earlier frames, close to the pose that was given
     PRIOR_KEPT = "prior kept"      # the pose that was given: the refinement could not be trusted
     LOST = "lost"                  # no pose: the frame does not fit what was seen before

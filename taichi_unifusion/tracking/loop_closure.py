@@ -16,7 +16,8 @@ NEIGHBORS = 2        # of them, so many are aligned beside the one before
 LOOPS = 2            # older keyframes that are aligned at most, by place and by appearance each
 MIN_OVERLAP = 0.3    # of a pair that is worth aligning
 LOOP_OVERLAP, LOOP_AGREEMENT = 0.25, 0.75  # of a pair that is believed; stricter than from frame to frame
-MAX_CORRECTION = 0.3, np.radians(15)  # [m, rad] by which alignment may move what features found
+LOOP_UNCERTAINTY = 0.02                    # [m] of its translation in the weakest direction
+MAX_CORRECTION = 0.3, np.radians(15)       # [m, rad] by which alignment may move what features found
 
 
 def neighbor_edges(keyframes: Keyframes, number: int, photometric_weight: float) -> list[Edge]:
@@ -62,5 +63,6 @@ def _edge(keyframes: Keyframes, other: int, number: int, photometric_weight: flo
 def believable(found: Registration, guess: NDArray) -> bool:
     """Whether two keyframes really see the same from there."""
     distance, angle = se3.distance(guess, found.T_target_source)
-    return (found.overlap > LOOP_OVERLAP and found.agreement > LOOP_AGREEMENT and found.determined
+    return (found.overlap > LOOP_OVERLAP and found.agreement > LOOP_AGREEMENT
+            and found.determined and found.uncertainty[-1] < LOOP_UNCERTAINTY
             and distance < MAX_CORRECTION[0] and angle < MAX_CORRECTION[1])
