@@ -122,6 +122,6 @@ class LatentSettings(MapSettings):
         if self.sampling != "cells" or self.fusion != "information":
             raise InputError("a map of features knows sampling 'cells' and fusion 'information' only, got "
                              f"'{self.sampling}' and '{self.fusion}'")
-        _check_choice("precision", self.precision, ("int8", "float16", "float32"))
+        check_choice("precision", self.precision, ("int8", "float16", "float32"))
         if not 2 <= self.encoder.rank <= MAX_LATENT_RANK:
             raise InputError(f"encoder: rank must lie in 2..{MAX_LATENT_RANK} in a map of features, got {self.encoder.rank}")
