@@ -10,7 +10,8 @@ import logging
 import os
 import platform
 import sys
-from contextlib import redirect_stdout
+import time
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
@@ -20,6 +21,7 @@ from .errors import CapacityError, InputError, MissingDependency, RuntimeStateEr
 logger = logging.getLogger(__name__)
 
 DEVICES = ("auto", "cuda", "cpu")
+STALE_LOCK = 60  # [s] Taichi locks its cache of compiled kernels for a second or two
 MAX_TREES = 12  # each reserves some 80 MB of a pool that fails silently somewhat above 1.6 GB
 
 
@@ -57,6 +59,7 @@ def init(device: str = "auto", *, threads: int | None = None, device_memory_gb: 
             return _runtime
         raise RuntimeStateError(f"device: Taichi already runs on {_runtime.device}; start a new process to use {device}")
     ti = _import_taichi()
+    _free_kernel_cache(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
     options = dict(log_level=ti.ERROR, offline_cache=True, debug=debug, default_fp=ti.f32, default_ip=ti.i32)
     if threads:
         options["cpu_max_num_threads"] = threads
@@ -88,6 +91,14 @@ def synchronize() -> None:
     import taichi as ti
 
     ti.sync()
+
+
+def _free_kernel_cache(folder: str) -> None:
+    """Remove the lock that a killed process left in Taichi's cache: under it every start would compile all kernels again."""
+    lock = Path(folder) / "ticache.lock"
+    with suppress(OSError):
+        if time.time() - lock.stat().st_mtime > STALE_LOCK:
+            lock.unlink()
 
 
 def _say(sentence: str) -> None:
