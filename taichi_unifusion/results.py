@@ -30,7 +30,8 @@ from .types import Mesh, Trajectory
 
 logger = logging.getLogger(__name__)
 
-TRACKING_FILE = "tracking.csv"
+TRACKING_FILES = ("tracking.csv", "tracking.txt")  # of every frame: verdicts, and poses
+ANSWER_FILES = ("query-*.ply", "query-*.png", "query.json", "segmentation.*")
 MESH_FILES = ("mesh.ply", "mesh.glb", "mesh.obj")
 
 
@@ -94,8 +95,9 @@ def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, abo
     `written` names files in the folder that belong to this run and are there already.
     """
     folder, started = ResultsFolder(prepare_results(directory), list(written)), time.perf_counter()
-    if TRACKING_FILE not in written:
-        folder.remove(TRACKING_FILE)
+    for name in TRACKING_FILES:
+        if name not in written:
+            folder.remove(name)
     logger.info("writing to %s", folder.directory)
     for name, saved in pipeline.maps.items():
         folder.write(f"maps/{name}.safetensors", saved.save)
@@ -115,11 +117,24 @@ def write_results(directory: str | Path, pipeline: Pipeline, run: RunResult, abo
         _write_mesh_files(folder, mesh, pipeline, run)
         for name, source in pipeline.sources.items():
             _write_property(folder, mesh, name, source.look, pipeline, run)
+    if not folder.failures:
+        _remove_others(folder, pipeline)
     seconds = {"frames": run.seconds, "mesh": extracted - extracting,
                "write": time.perf_counter() - started - (extracted - extracting)}
     metrics = {**(about or {}), **_metrics(folder, pipeline, run, mesh, seconds)}
     folder.write("metrics.json", lambda path: write_text(path, json.dumps(metrics, indent=2) + "\n"))
     return Results(folder.directory, tuple(folder.files), tuple(folder.failures), metrics)
+
+
+def _remove_others(folder: ResultsFolder, pipeline: Pipeline) -> None:
+    """Remove maps and properties of an earlier run in the folder, and answers that were asked of it."""
+    for file in sorted((folder.directory / "maps").glob("*.safetensors")):
+        if file.stem not in pipeline.maps:
+            for name in (f"maps/{file.name}", *property_files(file.stem)):
+                folder.remove(name)
+    for pattern in ANSWER_FILES:
+        for file in sorted(folder.directory.glob(pattern)):
+            folder.remove(file.name)
 
 
 def _write_mesh_files(folder: ResultsFolder, mesh: Mesh, pipeline: Pipeline, run: RunResult) -> None:

@@ -230,6 +230,17 @@ def test_R6_a_folder_that_cannot_be_written_is_told_before_the_first_frame(what,
     assert str(target / "out") in error and "frame 1 of" not in error
 
 
+def test_a_folder_that_is_used_again_holds_one_run(made, recording, tmp_path):
+    """Maps, properties and answers of an earlier run go, other people's files stay."""
+    out = shutil.copytree(made, tmp_path / "out")
+    shutil.copy(out / "maps" / "color.safetensors", out / "maps" / "style.safetensors")
+    old = ["style.ply", "style.png", "query-sofa.ply", "query.json", "segmentation.ply"]
+    for name in [*old, "notes.txt", "photo.png"]:
+        (out / name).write_text("of somebody")
+    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--out", str(out)]) == 0
+    assert files_in(out) == sorted([*OUTPUTS, "notes.txt", "photo.png"])
+
+
 def test_one_failing_output_does_not_cost_the_others(recording, tmp_path, monkeypatch, capsys):
     def full(path, mesh):
         if path.suffix == ".glb":

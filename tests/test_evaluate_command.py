@@ -386,6 +386,11 @@ def test_bad_input_is_one_sentence_and_exit_code_2(files, told, arguments, sente
     assert sentence in told(*arguments)
 
 
+@pytest.mark.parametrize("metric", ["surface", "rendering", "trajectory"])
+def test_a_folder_that_is_not_there_is_told(metric, told, tmp_path):
+    assert "nope: no such file or folder" in told(metric, tmp_path / "nope")
+
+
 @pytest.mark.parametrize(("arguments", "sentence"), [
     (["surface", "RESULTS"], "a recording of format 'folder' holds no true surface; give one"),
     (["rendering", "RESULTS", "--every", "3"], "the run has used every one of these frames"),

@@ -46,6 +46,16 @@ def test_trajectories_of_other_programs(kind, walk, tmp_path):
     np.testing.assert_allclose([f.T_world_camera for f in result.frames], poses, atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["frame-{:06d}.depth.png", "{}.png", "depth{:06d}.png"])
+def test_poses_of_a_folder_belong_to_the_numbers_in_names(name, walk, tmp_path):
+    """A cut of a recording, or every fifth of its files: places in it are not the numbers."""
+    for i, frame in enumerate(walk):
+        np.savetxt(tmp_path / f"frame-{100 + i:06d}.pose.txt", frame.T_world_camera)
+    kept = [replace(bare(frame), name="somewhere/" + name.format(100 + i)) for i, frame in enumerate(walk)][3::4]
+    result = track_sequence(Listed(kept), make_tracker("external", trajectory=tmp_path))
+    np.testing.assert_allclose([f.T_world_camera for f in result.frames], [f.T_world_camera for f in walk[3::4]], atol=1e-6)
+
+
 def test_our_own_trajectory_file_reads_back_without_time_stamps(walk, tmp_path):
     frames = [replace(frame, timestamp=None) for frame in walk[:6]]
     result = track_sequence(Listed(frames), RgbdTracker())

@@ -13,6 +13,7 @@ from tiny_recording import FLAGS
 from taichi_unifusion import cli
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.io import read_trajectory, write_trajectory
+from taichi_unifusion.results import TRACKING_FILES
 from taichi_unifusion.tracking import se3
 from taichi_unifusion.types import Trajectory
 
@@ -65,14 +66,16 @@ def test_external_poses_and_a_gap(tmp_path, capsys):
 
 def test_every_thins_the_map_and_not_the_tracking(tmp_path):
     assert cli.main([*FEW, "--every", "2", "--tracking", "rgbd", "--out", str(tmp_path)]) == 0
-    metrics, rows, _ = written(tmp_path)
-    assert len(rows) == 3 and metrics["frames"]["used"] == 2
+    metrics, rows, mapped = written(tmp_path)
+    assert len(rows) == 3 and metrics["frames"]["used"] == len(mapped) == 2
+    np.testing.assert_allclose(read_trajectory(tmp_path / "tracking.txt").T_world_camera[::2], mapped)  # all poses are kept
 
 
 def test_results_of_tracking_do_not_outlive_it(found, tmp_path):
-    (tmp_path / "tracking.csv").write_text("of an earlier run")
+    for name in TRACKING_FILES:
+        (tmp_path / name).write_text("of an earlier run")
     assert cli.main([*FEW, "--out", str(tmp_path)]) == 0
-    assert not (tmp_path / "tracking.csv").exists()
+    assert not any((tmp_path / name).exists() for name in TRACKING_FILES)
 
 
 @pytest.mark.parametrize("mode", ["given", "internal"])

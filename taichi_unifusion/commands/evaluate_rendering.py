@@ -73,9 +73,9 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     from ..evaluation.mesh_files import read_any_mesh
     from ..evaluation.rendering import WITHIN
     from ..evaluation.rendering import evaluate_rendering as evaluate
-    from ..evaluation.runs import read_run
+    from ..evaluation.runs import find_run
 
-    run = read_run(options.reconstruction) if options.reconstruction.is_dir() else None
+    run = find_run(options.reconstruction)
     mesh = run.mesh() if run else read_any_mesh(options.reconstruction)
     recording, run = _recording(options, run)
     chosen = choose_frames(options, run, len(recording), recording.name)

@@ -51,10 +51,10 @@ def evaluate_surface(options: EvaluateSurface) -> int:
     from .. import runtime
     from ..evaluation.geometry import transformed
     from ..evaluation.mesh_files import read_any_mesh
-    from ..evaluation.runs import read_run
+    from ..evaluation.runs import find_run, read_run
     from ..evaluation.surface import evaluate_surface as evaluate
 
-    run = read_run(options.reconstruction) if options.reconstruction.is_dir() else None
+    run = find_run(options.reconstruction)
     judge = run if options.seen_by is None else read_run(options.seen_by)
     if options.ground_truth is None and judge is None:
         raise InputError("surface: give the true mesh too: unifusion evaluate surface MESH TRUTH")

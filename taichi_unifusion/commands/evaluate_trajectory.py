@@ -63,10 +63,10 @@ def evaluate_trajectory(options: EvaluateTrajectory) -> int:
 
 
 def _read(options: EvaluateTrajectory) -> tuple[Trajectory, Trajectory]:
-    from ..evaluation.runs import read_run
+    from ..evaluation.runs import find_run
     from ..io import read_trajectory
 
-    run = read_run(options.estimate) if options.estimate.is_dir() else None
+    run = find_run(options.estimate)
     if run is None and options.ground_truth is None:
         raise InputError("trajectory: give the true poses too: unifusion evaluate trajectory FILE TRUTH")
     estimate = run.trajectory() if run else read_trajectory(options.estimate)

@@ -66,18 +66,18 @@ def reconstruct(options: Reconstruct, encoder: ImageEncoder | None = None) -> in
 def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop: Callable[[], bool],
                    encoder: ImageEncoder | None) -> int:
     from ..pipeline import Pipeline
-    from ..results import TRACKING_FILE, write_results
+    from ..results import TRACKING_FILES, write_results
 
     about, written = {"recording": {**options.about, "frames": len(frames)}}, []
     if options.tracked:
         frames, about["tracking"] = options.track(options, options.settings, directory, stop)
-        written = [TRACKING_FILE]
+        written = [*TRACKING_FILES]
     pipeline = Pipeline(options.settings, encoder=encoder)
     with frame_progress(len(frames)) as on_frame:
         run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
     if not run.steps:
         logger.warning("stopped before the first frame was done; %s",
-                       "tracking.csv and trajectory.txt hold the poses found until then" if written else "nothing was written")
+                       f"{' and '.join(written)} hold the poses found until then" if written else "nothing was written")
         return INTERRUPTED
     done = len(run.steps) + len(run.skipped)
     if done < len(frames):

@@ -47,11 +47,11 @@ class TrackingOptions:
         """The frames that are asked for with their poses, and what to say of them in the metrics.
 
         All frames between the first and the last are tracked, whatever `--every` leaves for the map: small steps are easier.
-        Poses are written to tracking.csv and trajectory.txt at once, so that they outlive whatever comes after.
+        Poses are written to tracking.csv and tracking.txt at once, so that they outlive whatever comes after.
         """
         from .. import runtime
         from ..io import write_trajectory
-        from ..results import TRACKING_FILE
+        from ..results import TRACKING_FILES
         from ..tracking import make_tracker
         from ..tracking.sequence import PosedFrames, track_sequence, write_tracking
 
@@ -62,6 +62,7 @@ class TrackingOptions:
         logger.info("tracking: %s", self.tracking)
         with frame_progress(len(frames)) as on_frame:
             result = track_sequence(frames, tracker, stop=stop, on_frame=on_frame)
-        write_tracking(directory / TRACKING_FILE, result)
-        write_trajectory(directory / "trajectory.txt", result.trajectory)
+        verdicts, poses = TRACKING_FILES
+        write_tracking(directory / verdicts, result)
+        write_trajectory(directory / poses, result.trajectory)
         return PosedFrames(frames, result)[::recording.every], {"mode": self.tracking, **result.details}

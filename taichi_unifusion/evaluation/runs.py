@@ -95,6 +95,13 @@ class Run:
         return Views(camera, self.T_recording_run() @ self.trajectory().T_world_camera, limits.depth_min, limits.depth_max)
 
 
+def find_run(path: Path) -> Run | None:
+    """The run of a results folder, or None for a file; raises FileError where there is neither."""
+    if not path.exists():
+        raise FileError(f"{path}: no such file or folder")
+    return read_run(path) if path.is_dir() else None
+
+
 def read_run(directory: str | Path) -> Run:
     """Read what `unifusion reconstruct` wrote beside its maps; raises FileError where that is missing or damaged."""
     directory = Path(directory)

@@ -37,7 +37,7 @@ class TextEmbeddings:
             if plain(text) in rows:
                 return rows[plain(text)]
         near = difflib.get_close_matches(_plain(text), [_plain(name) for name in self.names], n=3)
-        raise InputError(f"{self.name}: has no vector for '{text}'" + (f", did you mean {' or '.join(near)}?" if near else "")
+        raise InputError(f"{self.name}: has no vector for '{text}'" + (f", did you mean {' or '.join(near)}?" if near else ".")
                          + f" It holds {len(self.names)} names; with a text encoder any text can be asked")
 
     def has(self, text: str) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from .base import TrackedFrame, Tracker, TrackingResult, Verdict
 from .trajectory_files import ExternalPoses
 
 MAX_DIFFERENCE = 0.02       # [s] between a frame and its pose, as TUM's benchmark has it
+NUMBERED = r"[A-Za-z_-]*(\d+)(?:\.(?:color|depth))?\.[A-Za-z]+"  # names of images with the frame's number
 LONGEST_GAP = 1.0, 30.0     # [s] or frames; a longer gap is not interpolated: nobody knows what the camera did in it
 
 
@@ -27,6 +30,7 @@ class ExternalPoseTracker(Tracker):
         check_max_difference(max_difference)
         self.poses, self.interpolate, self.max_difference = poses, interpolate, max_difference
         self.frames: list[TrackedFrame] = []
+        self.keys: list[float] = []  # that frames were looked for under
 
     def track(self, frame: Frame) -> TrackedFrame:
         verdict, pose, message = self.pose_of(frame)
@@ -37,6 +41,7 @@ class ExternalPoseTracker(Tracker):
         """Verdict and T_world_camera of a frame, or None and why."""
         poses = self.poses
         key, unit, tolerance, longest = self._key(frame)
+        self.keys.append(key)
         at = int(nearest(poses.keys, np.array([key]))[0])
         gap = abs(poses.keys[at] - key)
         if gap <= tolerance:
@@ -47,15 +52,20 @@ class ExternalPoseTracker(Tracker):
             between = poses.T_world_camera[after - 1], poses.T_world_camera[after]
             share = (key - poses.keys[after - 1]) / (poses.keys[after] - poses.keys[after - 1])
             return Verdict.INTERPOLATED, interpolate(*between, share), ""
-        return Verdict.MISSING, None, f"{poses.source}: the nearest pose is {gap:g} {unit} away"
+        return Verdict.MISSING, None, f"{poses.source}: the nearest pose is {gap:g} {unit.rstrip('s') if gap == 1 and unit != 's' else unit} away"
 
     def _key(self, frame: Frame) -> tuple[float, str, float, float]:
         """What to look for: number or time stamp, its unit, how far off it may be, the longest gap to interpolate."""
         if not self.poses.by_time:
-            return float(frame.index), "frames", 0.0, LONGEST_GAP[1]
+            return float(self._number(frame)), "frames", 0.0, LONGEST_GAP[1]
         if frame.timestamp is None:  # frame numbers stand in for time stamps, as in a trajectory.txt of ours
             return float(frame.index), "frames", 1e-6, LONGEST_GAP[1]
         return frame.timestamp, "s", self.max_difference, LONGEST_GAP[0]
+
+    def _number(self, frame: Frame) -> int:
+        """A frame's number as the poses have it: in the name of its image, or its place in the recording."""
+        named = self.poses.by_name and re.fullmatch(NUMBERED, Path(frame.name).name)
+        return int(named[1]) if named else frame.index
 
     def skip(self, index: int, error: Exception) -> TrackedFrame:
         self.frames.append(super().skip(index, error))
@@ -65,13 +75,9 @@ class ExternalPoseTracker(Tracker):
         if not any(frame.T_world_camera is not None for frame in self.frames) and self.frames:
             raise DatasetError(f"{self.poses.source}: none of its {len(self.poses.keys)} poses belongs to a frame; its "
                                f"{'time stamps' if self.poses.by_time else 'frame numbers'} run from {self.poses.keys[0]:g} to "
-                               f"{self.poses.keys[-1]:g}, those of the frames from {self._key_of(self.frames[0])} to "
-                               f"{self._key_of(self.frames[-1])}")
+                               f"{self.poses.keys[-1]:g}, those of the frames from {min(self.keys, default=0):g} to "
+                               f"{max(self.keys, default=0):g}")
         return TrackingResult(tuple(self.frames), details={"trajectory": self.poses.source, "gaps": gaps(self.frames)})
-
-    def _key_of(self, frame: TrackedFrame) -> str:
-        by_time = self.poses.by_time and frame.timestamp is not None
-        return f"{frame.timestamp if by_time else frame.index:g}"
 
 
 def interpolate(T_a: NDArray, T_b: NDArray, share: float) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ class ExternalPoses:
     keys: NDArray[np.float64]            # (N,) ascending
     T_world_camera: NDArray[np.float64]  # (N, 4, 4)
     warnings: tuple[str, ...] = ()
+    by_name: bool = False                # frame numbers are those in the names of files, not places in the recording
 
 
 def read_poses(path: str | Path) -> ExternalPoses:
@@ -40,7 +41,8 @@ def read_poses(path: str | Path) -> ExternalPoses:
     """
     path = Path(path).expanduser()
     if path.is_dir():
-        return _checked(path, False, [(number, read_matrix_file(file)) for number, file in _numbered(path)])
+        poses = _checked(path, False, [(number, read_matrix_file(file)) for number, file in _numbered(path)])
+        return replace(poses, by_name=True)
     rows = [(split_row(line), f"{path} line {number}") for number, line in read_lines(path)]
     if not rows:
         raise DatasetError(f"{path}: holds no poses")
