@@ -1,4 +1,4 @@
-"""Uni-Fusion: posed RGB-D frames to Latent Implicit Maps to a coloured surface, with Taichi on CUDA and CPU.
+"""Uni-Fusion: RGB-D frames to Latent Implicit Maps of surface, colour and any property, with Taichi on CUDA and CPU.
 
 Names load when they are first used, so that `import taichi_unifusion` is quick and starts nothing.
 """

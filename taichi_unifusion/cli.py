@@ -34,7 +34,7 @@ from .terminal import DONE, FAILED, log_to_stderr, report
 
 logger = logging.getLogger(__name__)
 
-DESCRIPTION = ("RGB-D frames with camera poses in, a coloured surface out.\n\n"
+DESCRIPTION = ("RGB-D frames in, a map out: surface, colour, any property.\n\n"
                "unifusion COMMAND --help: explains a command\n\nunifusion --version: prints the version")
 
 COMMANDS: dict[str, tuple[type, Callable[..., int] | dict]] = {  # options and function, or a group: its help, its commands
