@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
 
-from .errors import CapacityError, InputError, MissingDependency, RuntimeStateError
+from .errors import CapacityError, MissingDependency, RuntimeStateError, check_choice
 
 logger = logging.getLogger(__name__)
 
@@ -52,8 +52,7 @@ def init(device: str = "auto", *, threads: int | None = None, device_memory_gb: 
     Raises InputError for an unknown device, RuntimeStateError where CUDA is asked for and absent, or another device is live.
     """
     global _runtime
-    if device not in DEVICES:
-        raise InputError(f"device: '{device}' is unknown, choose one of {', '.join(DEVICES)}")
+    check_choice("device", device, DEVICES)
     if _runtime is not None:
         if device in ("auto", _runtime.device):
             return _runtime

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FrameError, InputError
+from ..errors import FrameError, InputError, check_choice
 from ..types import Frame
 
 IMAGE_ENCODERS = {  # name -> module here, its function, what stands after the colon
@@ -58,8 +58,7 @@ def make_text_encoder(text: str, **options: Any) -> TextEncoder:
 
 def _make(text: str, encoders: dict[str, tuple[str, str, str]], what: str, options: dict[str, Any]) -> Any:
     name, _, where = text.partition(":")
-    if name not in encoders:
-        raise InputError(f"{what}: '{name}' is unknown, choose one of {', '.join(encoders)}")
+    check_choice(what, name, encoders)
     module, function, after = encoders[name]
     if not where:
         raise InputError(f"{what}: '{name}' needs more, as in {name}:{after.split(':')[0]} ({after})")

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FrameError, InputError, MissingDependency
+from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
 from ..types import Frame
 from . import unit_length
 
@@ -60,8 +60,7 @@ class ClipModel:
         self.mean, self.std = _normalization(name, self.kind)
 
     def _choose_device(self, device: str) -> str:
-        if device not in ("auto", "cpu", "cuda"):
-            raise InputError(f"device: '{device}' is unknown, choose one of auto, cpu, cuda")
+        check_choice("device", device, ("auto", "cpu", "cuda"))
         has_cuda = self.torch.cuda.is_available()
         if device == "cuda" and not has_cuda:
             raise MissingDependency("device: this torch finds no CUDA; use device 'cpu', or install torch for CUDA")
@@ -161,8 +160,7 @@ class ClipImageEncoder:
 def clip_image_encoder(name: str, *, method: Literal["dense", "crops"] = "dense", short_side: int = SHORT_SIDE,
                        device: str = "auto", download: bool = False) -> ClipImageEncoder:
     """Image encoder of a CLIP or SigLIP model, a folder or a name; InputError, FileError, MissingDependency as they come."""
-    if method not in METHODS:
-        raise InputError(f"method: '{method}' is unknown, choose one of {', '.join(METHODS)}")
+    check_choice("method", method, METHODS)
     if not 32 <= short_side <= 4096:
         raise InputError(f"short_side: must lie in 32..4096 pixels, got {short_side}")
     return ClipImageEncoder(_load(name, device, download), method, short_side)

@@ -13,7 +13,7 @@ from typing import BinaryIO, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FrameError, InputError, MissingDependency
+from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
 from ..types import Frame
 from . import unit_length
 
@@ -53,8 +53,7 @@ class FolderFeatures:
 def folder_features(folder: str | Path, *, layout: Literal["auto", "hwc", "chw"] = "auto") -> FolderFeatures:
     """The feature files in a folder; raises FileError where there are none."""
     folder = Path(folder)
-    if layout not in ("auto", "hwc", "chw"):
-        raise InputError(f"layout: '{layout}' is unknown, choose one of auto, hwc, chw")
+    check_choice("layout", layout, ("auto", "hwc", "chw"))
     if not folder.is_dir():
         raise FileError(f"{folder}: no such folder")
     files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix in SUFFIXES}

@@ -22,7 +22,7 @@ from types import NoneType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from ..config import Config
-from ..errors import InputError
+from ..errors import InputError, check_choice
 from ..maps.settings import PropertySettings
 from . import PROPERTIES
 from .base import SurfaceProperty
@@ -90,8 +90,7 @@ def _convert(text: str, wanted: Any, at: str) -> Any:
         wanted = next(option for option in get_args(wanted) if option is not NoneType)
     try:
         if get_origin(wanted) is Literal:
-            if text not in get_args(wanted):
-                raise InputError(f"{at}: '{text}' is unknown, choose one of {', '.join(get_args(wanted))}")
+            check_choice(at, text, get_args(wanted))
             return text
         if get_origin(wanted) is tuple:  # a size as 320x240, other numbers as 0.5/0.5/0.5
             whole = get_args(wanted)[0] is int

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import InputError
+from ..errors import InputError, check_choice
 from ..preprocessing import PreprocessSettings
 from .base import Tracker, TrackedFrame, TrackingResult, TrackingSettings, Verdict
 
@@ -25,8 +25,7 @@ def make_tracker(mode: str, settings: TrackingSettings | None = None, preprocess
 
     Raises InputError for an unknown mode or a trajectory that is missing or not used, DatasetError where it holds no poses.
     """
-    if mode not in MODES:
-        raise InputError(f"tracking: '{mode}' is unknown, choose one of {', '.join(MODES)}")
+    check_choice("tracking", mode, MODES)
     if mode == "external" and trajectory is None:
         raise InputError("tracking: external needs a trajectory file (--trajectory FILE)")
     if mode in ("given", "rgbd") and (trajectory is not None or interpolate):
