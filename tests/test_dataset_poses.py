@@ -10,7 +10,7 @@ from dataset_writers import (CAMERA, START, make_pose, make_samples, matrix_text
                              write_replica, write_scannet, write_scannet_flat, write_sens, write_seven_scenes, write_tum)
 
 from taichi_unifusion.datasets import open_dataset
-from taichi_unifusion.datasets.association import associate, nearest
+from taichi_unifusion.geometry.time_stamps import associate, nearest
 from taichi_unifusion.datasets.poses import rotation_from_quaternion
 from taichi_unifusion.errors import DatasetError, FrameError, InputError, PoseError
 

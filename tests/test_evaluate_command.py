@@ -13,7 +13,8 @@ from tiny_recording import FLAGS, make_frames, write_folder
 
 from taichi_unifusion import Trajectory, cli, load_map, open_dataset
 from taichi_unifusion.errors import FileError
-from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface, geometry
+from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
+from taichi_unifusion.geometry import triangles as geometry
 from taichi_unifusion.evaluation.mesh_files import read_any_mesh
 from taichi_unifusion.evaluation.runs import read_run
 from taichi_unifusion.io import read_mesh, read_trajectory, write_trajectory

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from taichi_unifusion.tracking import se3
+from taichi_unifusion.geometry import se3
 from taichi_unifusion.tracking.pose_graph import FLOOR, Edge, Prior, optimize, with_floor
 
 EXACT = 1e-9

@@ -12,7 +12,7 @@ import reference_registration as reference
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.kernels import registration as kernels
-from taichi_unifusion.tracking import se3
+from taichi_unifusion.geometry import se3
 from taichi_unifusion.tracking.pyramid import SurfelImage, SurfelPyramid, build_pyramid, reduce_frame, shrunk
 from taichi_unifusion.tracking.registration import Target, evaluate, register
 

@@ -12,7 +12,7 @@ from meshes import CAMERA, at, box, joined, mesh_of, moved, open3d_scene, random
 from taichi_unifusion import PinholeCamera, open_dataset
 from taichi_unifusion.errors import InputError, PoseError
 from taichi_unifusion.evaluation import Views, evaluate_surface
-from taichi_unifusion.evaluation.geometry import (
+from taichi_unifusion.geometry.triangles import (
     CANDIDATES,
     EXACT_M,
     SurfaceDistance,

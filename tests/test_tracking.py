@@ -14,7 +14,8 @@ from taichi_unifusion.config import Config
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.errors import FrameError, InputError, PoseError
-from taichi_unifusion.tracking import TrackedFrame, TrackingResult, TrackingSettings, Verdict, se3
+from taichi_unifusion.tracking import TrackedFrame, TrackingResult, TrackingSettings, Verdict
+from taichi_unifusion.geometry import se3
 from taichi_unifusion.tracking.features import extract_features, locate, most_similar
 from taichi_unifusion.tracking.given import GivenPoses
 from taichi_unifusion.tracking.internal import InternalTracker

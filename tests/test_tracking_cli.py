@@ -14,7 +14,7 @@ from taichi_unifusion import cli
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.io import read_trajectory, write_trajectory
 from taichi_unifusion.results import TRACKING_FILES
-from taichi_unifusion.tracking import se3
+from taichi_unifusion.geometry import se3
 from taichi_unifusion.types import Trajectory
 
 FEW = ["reconstruct", "synthetic", "--end", "3", *FLAGS]

@@ -8,7 +8,8 @@ import numpy as np
 
 from taichi_unifusion.datasets import Dataset
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
-from taichi_unifusion.tracking import TrackingResult, se3
+from taichi_unifusion.tracking import TrackingResult
+from taichi_unifusion.geometry import se3
 from taichi_unifusion.types import Frame
 
 

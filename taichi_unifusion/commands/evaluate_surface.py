@@ -49,7 +49,7 @@ def evaluate_surface(options: EvaluateSurface) -> int:
         raise InputError("surface: --whole and --seen-by exclude each other")
     options.check_out()
     from .. import runtime
-    from ..evaluation.geometry import transformed
+    from ..geometry.triangles import transformed
     from ..evaluation.mesh_files import read_any_mesh
     from ..evaluation.runs import find_run, read_run
     from ..evaluation.surface import evaluate_surface as evaluate

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import DatasetError
 from ..types import PinholeCamera
-from .association import check_max_difference, nearest
+from ..geometry.time_stamps import check_max_difference, nearest
 from .camera_yaml import CameraFile, read_camera_yaml
 from .intrinsics import check_size
 from .listing import list_names

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..errors import DatasetError, FrameError, MissingDependency, check_choice
 from ..types import Frame
-from .association import check_max_difference, nearest
+from ..geometry.time_stamps import check_max_difference, nearest
 from .base import Dataset
 from .checks import pose_warnings
 from .images import decode_color, depth_to_metres

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import DatasetError
 from ..types import PinholeCamera
-from .association import associate, check_max_difference, nearest
+from ..geometry.time_stamps import associate, check_max_difference, nearest
 from .intrinsics import check_size
 from .listing import list_names
 from .poses import Pose, TumRow, finite_or_none, read_lines, read_tum_rows

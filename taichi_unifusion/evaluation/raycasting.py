@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..types import Mesh, PinholeCamera, check_rigid
-from .geometry import check_mesh
+from ..geometry.triangles import check_mesh
 
 NEAR = 1e-3  # [m] nothing nearer to the camera is hit
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..types import Mesh
-from .geometry import SurfaceDistance, check_mesh, sample_surface
+from ..geometry.triangles import SurfaceDistance, check_mesh, sample_surface
 from .visibility import Views, points_within_view
 
 SAMPLES = 100_000

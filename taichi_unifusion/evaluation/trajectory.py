@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.association import associate
+from ..geometry.time_stamps import associate
 from ..errors import InputError
 from ..types import Trajectory, check_rigid
 

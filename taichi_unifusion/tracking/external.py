@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.association import check_max_difference, nearest
+from ..geometry.time_stamps import check_max_difference, nearest
 from ..errors import DatasetError
 from ..types import Frame
-from . import se3
+from ..geometry import se3
 from .base import TrackedFrame, Tracker, TrackingResult, Verdict
 from .trajectory_files import ExternalPoses
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from . import se3
+from ..geometry import se3
 from .base import TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
 from .odometry import KeyframeOdometry, View
 from .pose_graph import Edge, Prior

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from . import se3
+from ..geometry import se3
 from .features import locate, most_similar
 from .keyframes import Keyframes
 from .pose_graph import Edge

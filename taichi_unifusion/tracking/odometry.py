@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from . import se3
+from ..geometry import se3
 from .base import TrackedFrame, TrackingResult, TrackingSettings, Verdict
 from .features import Features, extract_features
 from .keyframes import Keyframe, Keyframes

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from . import se3
+from ..geometry import se3
 from .registration import Registration
 
 ITERATIONS = 60

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from . import se3
+from ..geometry import se3
 from .pyramid import SurfelPyramid
 
 ITERATIONS = (8, 10, 12)      # at most, by level, finest first

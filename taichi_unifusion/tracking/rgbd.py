@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from . import se3
+from ..geometry import se3
 from .base import TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
 from .features import locate, most_similar
 from .loop_closure import believable

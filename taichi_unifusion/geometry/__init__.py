@@ -1,0 +1,1 @@
+"""NumPy mathematics that several rooms need: rigid motions, triangles, time stamps."""
