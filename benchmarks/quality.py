@@ -27,7 +27,7 @@ import taichi_unifusion as uf
 from taichi_unifusion.errors import UniFusionError
 from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
 from taichi_unifusion.evaluation.rendering import FrameScore
-from taichi_unifusion.io import check_writable
+from taichi_unifusion.files.atomic import check_writable
 from taichi_unifusion.types import Frame
 
 DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))

@@ -18,7 +18,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import yaml
 
 from .errors import ConfigError, InputError
-from .io import read_bytes
+from .files.atomic import read_bytes
 from .maps.settings import LatentSettings, PropertySettings, SurfaceSettings
 from .preprocessing import PreprocessSettings
 from .tracking.base import TrackingSettings

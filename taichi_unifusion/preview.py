@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import runtime
 from .errors import InputError
-from .io import atomic_write
+from .files.atomic import atomic_write
 from .types import Mesh, PinholeCamera, Trajectory, check_rigid
 
 VIEWS = {  # name -> what it shows

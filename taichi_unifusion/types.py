@@ -237,7 +237,7 @@ class Mesh:
 
     def save(self, path) -> None:
         """Write the mesh; the suffix chooses PLY, GLB or OBJ."""
-        from .io import write_mesh
+        from .files.atomic import write_mesh
 
         write_mesh(path, self)
 

@@ -12,7 +12,7 @@ from test_visibility import CAMERA, VS, pose
 
 from taichi_unifusion import Frame, PointCloud, SurfaceMap, load_map, preprocess
 from taichi_unifusion.errors import InputError, MapCorrupt, OutOfRange, PoseError, SizeMismatch
-from taichi_unifusion.map_files import read_map, write_map
+from taichi_unifusion.files.maps import read_map, write_map
 from taichi_unifusion.maps import voxel_grid
 from taichi_unifusion.types import DepthView
 

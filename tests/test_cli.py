@@ -24,8 +24,8 @@ import taichi_unifusion as uf
 from taichi_unifusion import cli, results
 from taichi_unifusion.commands.info import Info
 from taichi_unifusion.config import Config, dump_config, load_config
-from taichi_unifusion.io import read_mesh, read_trajectory
-from taichi_unifusion.map_files import read_map
+from taichi_unifusion.files.atomic import read_mesh, read_trajectory
+from taichi_unifusion.files.maps import read_map
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUTS = ["config.yaml", "maps/color.safetensors", "maps/surface.safetensors", "mesh.glb", "mesh.ply", "metrics.json",

@@ -15,7 +15,7 @@ from dataset_writers import make_samples, write_folder, write_image, write_repli
 
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.checks import guess_depth_scale
-from taichi_unifusion.datasets.images import depth_file_size, read_color, read_depth
+from taichi_unifusion.files.images import depth_file_size, read_color, read_depth
 from taichi_unifusion.errors import FrameError, InputError, SizeMismatch
 
 REFUSED_COST = 2 << 20  # [bytes] allocated while refusing a hostile header; its image would take gigabytes

@@ -11,7 +11,7 @@ from dataset_writers import (CAMERA, START, make_pose, make_samples, matrix_text
 
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.geometry.time_stamps import associate, nearest
-from taichi_unifusion.datasets.poses import rotation_from_quaternion
+from taichi_unifusion.files.poses import rotation_from_quaternion
 from taichi_unifusion.errors import DatasetError, FrameError, InputError, PoseError
 
 EXACT = 1e-12  # double arithmetic on numbers near one

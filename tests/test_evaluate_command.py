@@ -15,9 +15,9 @@ from taichi_unifusion import Trajectory, cli, load_map, open_dataset
 from taichi_unifusion.errors import FileError
 from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
 from taichi_unifusion.geometry import triangles as geometry
-from taichi_unifusion.evaluation.mesh_files import read_any_mesh
+from taichi_unifusion.files.foreign_meshes import read_any_mesh
 from taichi_unifusion.evaluation.runs import read_run
-from taichi_unifusion.io import read_mesh, read_trajectory, write_trajectory
+from taichi_unifusion.files.atomic import read_mesh, read_trajectory, write_trajectory
 
 FRAMES, EVERY = 7, 3     # frames 0, 3 and 6 are used
 SAMPLES = "3000"

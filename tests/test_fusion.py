@@ -13,7 +13,7 @@ from taichi_unifusion import PropertyMap, SurfaceMap, load_map
 from taichi_unifusion.encoding import EncoderSettings
 from taichi_unifusion.errors import MapCorrupt, OutOfRange
 from taichi_unifusion.kernels import fusion
-from taichi_unifusion.map_files import read_map, write_map
+from taichi_unifusion.files.maps import read_map, write_map
 from taichi_unifusion.maps import voxel_grid
 from taichi_unifusion.maps.regressor import sum_count
 

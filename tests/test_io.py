@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from taichi_unifusion.errors import DatasetError, FileError, PoseError
-from taichi_unifusion.io import (
+from taichi_unifusion.files.atomic import (
     atomic_write,
     check_writable,
     quaternion_to_rotation,

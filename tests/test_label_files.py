@@ -10,7 +10,7 @@ import pytest
 from meshes import rectangle
 
 from taichi_unifusion.errors import FileError, InputError
-from taichi_unifusion.evaluation.label_files import read_class_names, read_labels
+from taichi_unifusion.files.labels import read_class_names, read_labels
 
 
 def test_M6_an_array_with_a_payload_is_refused_and_not_run(tmp_path):

@@ -13,7 +13,7 @@ import taichi as ti
 from taichi_unifusion import PinholeCamera, PointCloud, load_map
 from taichi_unifusion.errors import FrameError, InputError, MapCorrupt
 from taichi_unifusion.kernels import latent, latent_query
-from taichi_unifusion.map_files import read_map, write_map
+from taichi_unifusion.files.maps import read_map, write_map
 from taichi_unifusion.maps import LatentMap
 from taichi_unifusion.types import FeatureImage
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from taichi_unifusion.errors import FileError, InputError, MapCorrupt
-from taichi_unifusion.map_files import FORMAT, read_manifest, read_map, write_map
+from taichi_unifusion.files.maps import FORMAT, read_manifest, read_map, write_map
 
 TENSORS = {
     "features": np.random.default_rng(0).normal(size=(7, 20, 3)).astype(np.float32),

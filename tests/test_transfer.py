@@ -17,7 +17,7 @@ from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 from taichi_unifusion import Pipeline, PropertyMap, cli
 from taichi_unifusion.config import dump_config, load_config
 from taichi_unifusion.errors import InputError
-from taichi_unifusion.io import read_mesh
+from taichi_unifusion.files.atomic import read_mesh
 from taichi_unifusion.properties import Look, SurfaceProperty
 from taichi_unifusion.properties.legend import HEIGHT
 from taichi_unifusion.results import write_results

@@ -10,7 +10,7 @@ import pytest
 from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 
 from taichi_unifusion import Pipeline, cli, load_map
-from taichi_unifusion.io import read_mesh
+from taichi_unifusion.files.atomic import read_mesh
 from taichi_unifusion.maps import LatentMap
 from taichi_unifusion.results import write_results
 

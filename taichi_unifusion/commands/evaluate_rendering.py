@@ -70,7 +70,7 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
 
     from .. import runtime
     from ..config import Config
-    from ..evaluation.mesh_files import read_any_mesh
+    from ..files.foreign_meshes import read_any_mesh
     from ..evaluation.rendering import WITHIN
     from ..evaluation.rendering import evaluate_rendering as evaluate
     from ..evaluation.runs import find_run

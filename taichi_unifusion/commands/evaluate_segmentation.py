@@ -15,7 +15,7 @@ from ..terminal import format_table
 from .scores import ScoreOptions, percent
 
 if TYPE_CHECKING:
-    from ..evaluation.label_files import LabelFile
+    from ..files.labels import LabelFile
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class EvaluateSegmentation(ScoreOptions):
 def evaluate_segmentation(options: EvaluateSegmentation) -> int:
     """Labels -> table."""
     options.check_out()
-    from ..evaluation.label_files import read_class_names, read_labels
+    from ..files.labels import read_class_names, read_labels
     from ..evaluation.segmentation import evaluate_segmentation as evaluate
 
     names = read_class_names(options.names) if options.names else None

@@ -50,7 +50,7 @@ def evaluate_surface(options: EvaluateSurface) -> int:
     options.check_out()
     from .. import runtime
     from ..geometry.triangles import transformed
-    from ..evaluation.mesh_files import read_any_mesh
+    from ..files.foreign_meshes import read_any_mesh
     from ..evaluation.runs import find_run, read_run
     from ..evaluation.surface import evaluate_surface as evaluate
 

@@ -64,7 +64,7 @@ def evaluate_trajectory(options: EvaluateTrajectory) -> int:
 
 def _read(options: EvaluateTrajectory) -> tuple[Trajectory, Trajectory]:
     from ..evaluation.runs import find_run
-    from ..io import read_trajectory
+    from ..files.atomic import read_trajectory
 
     run = find_run(options.estimate)
     if run is None and options.ground_truth is None:

@@ -46,7 +46,7 @@ def query(options: Query) -> int:
 
     if not options.texts:
         raise InputError("query: say what to look for, for example: unifusion query results/flat \"sofa\"")
-    from ..io import check_writable, write_text
+    from ..files.atomic import check_writable, write_text
     from ..language.questions import ask
     from ..results import ResultsFolder
 
@@ -55,7 +55,7 @@ def query(options: Query) -> int:
     encoder = options.encoder(understood.features.settings.source)
     answers = ask(understood.features, understood.mesh, encoder, options.texts, negatives=options.negative,
                   threshold=options.threshold, min_area=options.min_area, templates=options.templates)
-    from ..io import write_mesh
+    from ..files.atomic import write_mesh
     from ..language.pictures import cameras_that_see, heat_mesh
     from ..preview import render_preview
 

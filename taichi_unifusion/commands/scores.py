@@ -27,7 +27,7 @@ class ScoreOptions:
     def check_out(self) -> None:
         """Raise FileError if `out` cannot be written, before any work is spent."""
         if self.out:
-            from ..io import check_writable
+            from ..files.atomic import check_writable
 
             check_writable(self.out.parent)
 
@@ -35,7 +35,7 @@ class ScoreOptions:
         """Print blocks of text with an empty line between them, or JSON, and write the file; returns the exit code."""
         text = json.dumps(_plain({**about, **dataclasses.asdict(result)}), indent=2)
         if self.out:
-            from ..io import atomic_write
+            from ..files.atomic import atomic_write
 
             with atomic_write(self.out) as temporary:
                 temporary.write_text(text + "\n", encoding="utf-8")

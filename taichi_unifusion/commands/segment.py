@@ -35,7 +35,7 @@ class Segment(TextOptions):
 def segment(options: Segment) -> int:
     """Names -> labelled mesh, picture, scores."""
     names = read_labels_file(options.labels)
-    from ..io import check_writable, write_mesh, write_text
+    from ..files.atomic import check_writable, write_mesh, write_text
     from ..language.pictures import label_colors, label_mesh, segmentation_picture
     from ..language.questions import segment as segment_points
     from ..preview import write_png
@@ -64,7 +64,7 @@ def segment(options: Segment) -> int:
 def read_labels_file(path: Path) -> dict[int, str]:
     """Label -> name of a file of names; raises FileError where it holds none, InputError for a name or number given twice."""
     from ..errors import FileError
-    from ..io import read_bytes
+    from ..files.atomic import read_bytes
 
     try:
         lines = read_bytes(path).decode("utf-8-sig").splitlines()
@@ -85,7 +85,7 @@ def read_labels_file(path: Path) -> dict[int, str]:
 
 
 def _read_truth(path: Path) -> Any:
-    from ..io import read_mesh
+    from ..files.atomic import read_mesh
 
     mesh = read_mesh(path)
     if "label" not in mesh.attributes:

@@ -11,7 +11,7 @@ import yaml
 
 from ..errors import DatasetError
 from ..types import PinholeCamera
-from .images import INVALID_DEPTH
+from ..files.images import INVALID_DEPTH
 from .intrinsics import make_camera
 
 MAX_BYTES = 16_384  # a camera takes ten lines; more is another file

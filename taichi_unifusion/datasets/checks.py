@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import PinholeCamera
-from .poses import Pose
+from ..files.poses import Pose
 
 MIN_IDENTITIES = 3     # the first frame often is the origin; more of them mean that nobody tracked
 MAX_JUMP = 1.0         # [m] between consecutive frames

@@ -23,7 +23,16 @@ from ..geometry.time_stamps import check_max_difference, nearest
 from .camera_yaml import CameraFile, read_camera_yaml
 from .intrinsics import check_size
 from .listing import list_names
-from .poses import Pose, TumRow, finite_or_none, matrix_from_row, read_lines, read_matrix_file, split_row, tum_row
+from ..files.poses import (
+    Pose,
+    TumRow,
+    finite_or_none,
+    matrix_from_row,
+    read_lines,
+    read_matrix_file,
+    split_row,
+    tum_row,
+)
 from .recording import FrameFiles, Recording, depth_size
 
 DEPTH_SUFFIXES, COLOR_SUFFIXES, INFRARED_SUFFIXES = (".png", ".npy"), (".png", ".jpg", ".jpeg"), (".png",)

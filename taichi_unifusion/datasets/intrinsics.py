@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import DatasetError, InputError
 from ..types import PinholeCamera
-from .poses import parse_numbers, read_lines, split_row
+from ..files.poses import parse_numbers, read_lines, split_row
 
 
 def make_camera(source: str, size: tuple[int, int], fx: float, fy: float, cx: float, cy: float) -> PinholeCamera:

@@ -26,10 +26,10 @@ from ..types import Frame
 from ..geometry.time_stamps import check_max_difference, nearest
 from .base import Dataset
 from .checks import pose_warnings
-from .images import decode_color, depth_to_metres
+from ..files.images import decode_color, depth_to_metres
 from .k4a_calibration import read_calibration
 from .lens_camera import color_for_depth, splat_depth
-from .poses import Pose, read_tum_rows
+from ..files.poses import Pose, read_tum_rows
 
 DEPTH_SCALE = 1000.0
 TRACKS = ("DEPTH", "COLOR", "IR")  # titles

@@ -17,8 +17,16 @@ from ..errors import DatasetError, FrameError, InputError
 from ..types import Frame, PinholeCamera
 from .base import Dataset
 from .checks import camera_warnings, pose_warnings
-from .images import INVALID_DEPTH, depth_file_size, read_color, read_depth, read_infrared, resize_color, resize_image
-from .poses import Pose
+from ..files.images import (
+    INVALID_DEPTH,
+    depth_file_size,
+    read_color,
+    read_depth,
+    read_infrared,
+    resize_color,
+    resize_image,
+)
+from ..files.poses import Pose
 
 SIZE_SAMPLES = 5  # depth headers read to learn the size, so that one odd file does not decide it
 

@@ -16,7 +16,7 @@ from ..errors import DatasetError
 from ..types import PinholeCamera
 from .intrinsics import check_size, make_camera
 from .listing import file_of, first_existing, numbered_files
-from .poses import Pose, read_matrix_rows
+from ..files.poses import Pose, read_matrix_rows
 from .recording import FrameFiles, Recording, check_depth_scale, depth_size
 
 DEPTH_SCALE = 6553.5

@@ -16,7 +16,7 @@ from ..errors import DatasetError
 from ..types import PinholeCamera
 from .intrinsics import check_size, make_camera, read_matrix_camera
 from .listing import file_of, first_existing, list_names, numbered_files
-from .poses import parse_numbers, read_lines, read_matrix_file
+from ..files.poses import parse_numbers, read_lines, read_matrix_file
 from .recording import FrameFiles, Recording, check_depth_scale, depth_size
 from .sens import SensFile
 from .seven_scenes import flat_frames, no_flat_poses

@@ -25,10 +25,10 @@ from ..errors import DatasetError, FrameError
 from ..types import Frame, PinholeCamera
 from .base import Dataset
 from .checks import camera_warnings, pose_warnings
-from .image_headers import MAX_PIXELS
-from .images import INVALID_DEPTH, decode_color, depth_to_metres, resize_color
+from ..files.image_headers import MAX_PIXELS
+from ..files.images import INVALID_DEPTH, decode_color, depth_to_metres, resize_color
 from .intrinsics import check_size, make_camera
-from .poses import Pose
+from ..files.poses import Pose
 from .recording import check_depth_scale
 
 VERSION = 4

@@ -14,7 +14,7 @@ from ..errors import DatasetError
 from ..types import PinholeCamera
 from .intrinsics import check_size, make_camera, read_matrix_camera
 from .listing import file_of, first_existing, list_names, numbered_files
-from .poses import read_matrix_file
+from ..files.poses import read_matrix_file
 from .recording import FrameFiles, Recording, depth_size
 
 DEPTH_SCALE = 1000.0

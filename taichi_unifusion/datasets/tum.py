@@ -20,7 +20,7 @@ from ..types import PinholeCamera
 from ..geometry.time_stamps import associate, check_max_difference, nearest
 from .intrinsics import check_size
 from .listing import list_names
-from .poses import Pose, TumRow, finite_or_none, read_lines, read_tum_rows
+from ..files.poses import Pose, TumRow, finite_or_none, read_lines, read_tum_rows
 from .recording import FrameFiles, Recording, depth_size
 
 DEPTH_SCALE = 5000.0

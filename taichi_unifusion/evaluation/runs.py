@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..config import Config, load_config
 from ..datasets import Dataset, open_dataset
 from ..errors import DatasetError, FileError, FrameError
-from ..io import read_bytes, read_mesh, read_trajectory
+from ..files.atomic import read_bytes, read_mesh, read_trajectory
 from ..types import Mesh, Trajectory
 from .trajectory import align_poses, match_poses
 from .visibility import Views

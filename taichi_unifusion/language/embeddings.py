@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
-from ..io import read_bytes
+from ..files.atomic import read_bytes
 from . import unit_length
 
 

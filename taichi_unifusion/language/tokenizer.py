@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
-from ..io import read_bytes
+from ..files.atomic import read_bytes
 
 MERGES = 49152 - 256 - 2  # that CLIP uses of the published list, which is longer
 WORD_END = "</w>"

@@ -14,7 +14,7 @@ from .. import runtime
 from ..encoding import EncoderSettings
 from ..errors import InputError, MapCorrupt
 from ..kernels import visibility, voxels
-from ..map_files import read_map, write_map
+from ..files.maps import read_map, write_map
 from ..types import PointCloud
 from .frame_blocks import FrameBlocks
 from .regressor import Regressor, sum_count

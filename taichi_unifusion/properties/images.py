@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.images import read_values
+from ..files.images import read_values
 from ..datasets.listing import list_names
 from ..errors import FrameError, InputError
 from ..types import Frame

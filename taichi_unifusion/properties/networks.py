@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, FrameError, InputError, check_choice
-from ..io import read_bytes
+from ..files.atomic import read_bytes
 from ..onnx_session import open_session, run_session
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ..datasets import Dataset, DatasetView
 from ..errors import FrameError, PoseError
-from ..io import atomic_write
+from ..files.atomic import atomic_write
 from ..loading import index_in_recording, load_ahead
 from ..run_log import name_of
 from ..types import Frame

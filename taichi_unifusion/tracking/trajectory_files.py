@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datasets.listing import list_names
-from ..datasets.poses import Pose, matrix_from_row, read_lines, read_matrix_file, split_row, tum_row
+from ..files.poses import Pose, matrix_from_row, read_lines, read_matrix_file, split_row, tum_row
 from ..errors import DatasetError, PoseError
 
 FORMATS = {8: "TUM (timestamp tx ty tz qx qy qz qw)", 12: "KITTI (the first 3 rows of a 4x4 matrix)",

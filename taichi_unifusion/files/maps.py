@@ -19,8 +19,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import FileError, InputError, MapCorrupt, UniFusionError
-from .io import atomic_write, file_error
+from ..errors import FileError, InputError, MapCorrupt, UniFusionError
+from .atomic import atomic_write, file_error
 
 FORMAT = "taichi_unifusion LIM"
 FORMAT_VERSION = 1

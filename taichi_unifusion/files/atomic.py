@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DatasetError, FileError, InputError, MissingDependency, UniFusionError
+from ..errors import DatasetError, FileError, InputError, MissingDependency, UniFusionError
 from .ply import color_to_uint8, parse_ply, write_ply
-from .types import Mesh, Trajectory, check_rigid
+from ..types import Mesh, Trajectory, check_rigid
 
 UNIT_TOLERANCE = 1e-3  # | |q| - 1 | of a quaternion in a file: 4 printed digits pass, a wrong column does not
 

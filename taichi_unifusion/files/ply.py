@@ -10,8 +10,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import FileError, InputError
-from .types import Mesh
+from ..errors import FileError, InputError
+from ..types import Mesh
 
 MAX_HEADER = 1 << 16  # bytes; real headers have some hundred
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
-from ..io import read_bytes, read_mesh
+from .atomic import read_bytes, read_mesh
 
 SUFFIXES = (".ply", ".txt", ".npy")
 

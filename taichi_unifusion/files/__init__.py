@@ -1,0 +1,1 @@
+"""Every file format, both ways; no other room opens files."""
