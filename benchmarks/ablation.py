@@ -25,7 +25,7 @@ from quality_scenes import DEPTH_RANGE, SCENES, Scene
 import taichi_unifusion as uf
 from taichi_unifusion.encoding import EncoderSettings, PositionEncoding
 from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
-from taichi_unifusion.preview import View, render_mesh
+from taichi_unifusion.rendering.preview import View, render_mesh
 from taichi_unifusion.types import Mesh
 
 VOXEL_SIZES = (0.02, 0.03, 0.05, 0.07, 0.10)  # [m]

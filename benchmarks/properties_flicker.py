@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import taichi_unifusion as uf
 from taichi_unifusion.datasets.scene import SceneDataset
-from taichi_unifusion.evaluation.raycasting import RayCaster
+from taichi_unifusion.rendering.raycaster import RayCaster
 from taichi_unifusion.evaluation.rendering import render_frame
 from taichi_unifusion.properties import make_property
 

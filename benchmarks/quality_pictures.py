@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from quality_methods import Reconstruction
 from quality_scenes import DEPTH_RANGE, Scene
 
-from taichi_unifusion.evaluation.raycasting import RayCaster
+from taichi_unifusion.rendering.raycaster import RayCaster
 from taichi_unifusion.evaluation.rendering import render_frame
 from taichi_unifusion.types import Frame
 

@@ -22,9 +22,9 @@ from .config import dump_config
 from .errors import FileError, InputError
 from .files.atomic import check_writable, write_mesh, write_text, write_trajectory
 from .pipeline import FEATURES, Pipeline
-from .preview import draw_preview, render_preview, write_png
+from .rendering.preview import draw_preview, render_preview, write_png
 from .properties.base import Look
-from .properties.legend import draw_legend, property_mesh, shown_range
+from .rendering.legend import draw_legend, property_mesh, shown_range
 from .run_log import RunResult, StepResult
 from .types import Mesh, Trajectory
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from taichi_unifusion.datasets.textured_scene import BACKGROUND, LIGHT, TexturedScene, mip_levels
-from taichi_unifusion.kernels.texturing import MAX_TAPS, SAMPLES, SHADE, SLACK
+from taichi_unifusion.rendering.textured_scene import BACKGROUND, LIGHT, TexturedScene, mip_levels
+from taichi_unifusion.rendering.kernels.texturing import MAX_TAPS, SAMPLES, SHADE, SLACK
 from taichi_unifusion.types import PinholeCamera
 
 STEP = 1e-4  # [px] of the finite differences

@@ -10,7 +10,7 @@ import pytest
 
 from taichi_unifusion import runtime
 from taichi_unifusion.errors import InputError, PoseError
-from taichi_unifusion.preview import View, render_mesh, render_preview
+from taichi_unifusion.rendering.preview import View, render_mesh, render_preview
 from taichi_unifusion.types import Mesh, PinholeCamera, Trajectory
 
 cv2 = pytest.importorskip("cv2")
@@ -86,8 +86,8 @@ def is_like(pixel, color) -> bool:
 
 def rasterize(vertices, faces, T_world_camera, near):
     """Depth (H, W), 0 where nothing is seen, and triangle (H, W) of the kernel."""
-    from taichi_unifusion.kernels.raster import EMPTY
-    from taichi_unifusion.kernels.raster import rasterize as kernel
+    from taichi_unifusion.rendering.kernels.raster import EMPTY
+    from taichi_unifusion.rendering.kernels.raster import rasterize as kernel
 
     runtime.current()
     nearest = np.zeros((CAMERA.height, CAMERA.width), np.int64)

@@ -12,7 +12,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from taichi_unifusion import Frame, PinholeCamera, open_dataset
 from taichi_unifusion.errors import InputError, PoseError
 from taichi_unifusion.evaluation import evaluate_rendering
-from taichi_unifusion.evaluation.raycasting import RayCaster
+from taichi_unifusion.rendering.raycaster import RayCaster
 from taichi_unifusion.evaluation.rendering import psnr, render_frame, ssim
 
 ROUNDING = 1e-4    # [cm] depth is float32

@@ -9,7 +9,7 @@ import reference_scene as reference
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.scene import SceneDataset, kinect_camera
 from taichi_unifusion.datasets.synthetic import look_at
-from taichi_unifusion.datasets.textured_scene import load_scene, mip_levels
+from taichi_unifusion.rendering.textured_scene import load_scene, mip_levels
 from taichi_unifusion.errors import DatasetError, InputError, PoseError
 from taichi_unifusion.files.atomic import write_trajectory
 from taichi_unifusion.types import PinholeCamera, Trajectory

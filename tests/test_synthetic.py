@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from taichi_unifusion.datasets.primitives import CHORD_ERROR
+from taichi_unifusion.rendering.primitives import CHORD_ERROR
 from taichi_unifusion.datasets.synthetic import SyntheticRoom, look_at
 from taichi_unifusion.errors import InputError
-from taichi_unifusion.kernels.raycast import kinect_depth
+from taichi_unifusion.rendering.kernels.solids import kinect_depth
 from taichi_unifusion.runtime import current
 from taichi_unifusion.types import PinholeCamera
 

@@ -19,7 +19,7 @@ from taichi_unifusion.config import dump_config, load_config
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.files.atomic import read_mesh
 from taichi_unifusion.properties import Look, SurfaceProperty
-from taichi_unifusion.properties.legend import HEIGHT
+from taichi_unifusion.rendering.legend import HEIGHT
 from taichi_unifusion.results import write_results
 
 CONSTANT = 1e-3  # a constant comes back everywhere where the map is valid, rims included

@@ -57,7 +57,7 @@ def query(options: Query) -> int:
                   threshold=options.threshold, min_area=options.min_area, templates=options.templates)
     from ..files.atomic import write_mesh
     from ..language.pictures import cameras_that_see, heat_mesh
-    from ..preview import render_preview
+    from ..rendering.preview import render_preview
 
     listed = []
     for answer in answers:

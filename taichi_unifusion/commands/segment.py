@@ -38,7 +38,7 @@ def segment(options: Segment) -> int:
     from ..files.atomic import check_writable, write_mesh, write_text
     from ..language.pictures import label_colors, label_mesh, segmentation_picture
     from ..language.questions import segment as segment_points
-    from ..preview import write_png
+    from ..rendering.preview import write_png
     from ..results import ResultsFolder
 
     truth = _read_truth(options.truth) if options.truth else None

@@ -14,7 +14,7 @@ from ..files.atomic import read_trajectory
 from ..types import Frame, Mesh, PinholeCamera, Trajectory
 from .base import Dataset
 from .synthetic import FOCAL_PER_WIDTH
-from .textured_scene import TexturedScene, View, load_scene
+from ..rendering.textured_scene import TexturedScene, View, load_scene
 
 
 class SceneDataset(Dataset):
@@ -88,7 +88,7 @@ def kinect_camera(width: int = 640, height: int = 480) -> PinholeCamera:
 def kinect_reading(view: View, camera: PinholeCamera, seed: int, frame: int) -> NDArray[np.float32]:
     """What a Kinect v1 would read there, (H, W) [m], 0 where it has no reading; depends on seed, frame and pixel alone."""
     runtime.current()
-    from ..kernels.raycast import kinect_depth
+    from ..rendering.kernels.solids import kinect_depth
 
     depth = np.zeros_like(view.depth)
     hits = view.depth[view.depth > 0]

@@ -16,13 +16,13 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..kernels.raycast import TILE, cast_rays, kinect_depth
-from ..kernels.textures import PATTERNS, shade_surfaces
+from ..rendering.kernels.solids import TILE, cast_rays, kinect_depth
+from ..rendering.kernels.textures import PATTERNS, shade_surfaces
 from ..runtime import current
 from ..types import Frame, Mesh, PinholeCamera
 from .base import Dataset
-from .primitives import Primitive, tessellate
-from .room import MATERIALS, ROOM_SIZE, furnished_room
+from ..rendering.primitives import Primitive, tessellate
+from ..rendering.room import MATERIALS, ROOM_SIZE, furnished_room
 
 FOCAL_PER_WIDTH = 575.0 / 640.0  # Kinect v1's depth camera
 FRAME_RATE = 30.0                # [Hz]

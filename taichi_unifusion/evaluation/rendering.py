@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, PoseError
 from ..types import Frame, Mesh
-from .raycasting import RayCaster
+from ..rendering.raycaster import RayCaster
 
 WITHIN = 0.025       # [m] an error below it counts as a good reading
 SSIM_SIGMA = 1.5     # [px] of the Gaussian window, with the constants below as Wang et al. 2004 give them

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..types import Mesh, PinholeCamera, check_rigid
-from .raycasting import RayCaster, RayHits
+from ..rendering.raycaster import RayCaster, RayHits
 
 STEEPEST = 8.0  # slope of depth, in depths of one pixel's width a pixel: about 80 degrees; beyond it a plane is not trusted
 

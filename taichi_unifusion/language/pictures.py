@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..preview import draw_preview
+from ..rendering.preview import draw_preview
 from ..types import Mesh, Trajectory
 from .questions import UNLABELLED, Segmentation
 

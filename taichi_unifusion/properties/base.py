@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError, InputError, UniFusionError
 from ..maps.settings import PropertySettings
 from ..types import Frame
-from .colormaps import check_colormap
+from ..rendering.colormaps import check_colormap
 
 RESERVED = ("surface", "color", "mesh", "preview", "normals", "features")  # files and attributes of every results folder
 

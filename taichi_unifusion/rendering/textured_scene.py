@@ -60,7 +60,7 @@ class TexturedScene:
         on_device = self._on_device
         import taichi as ti
 
-        from ..kernels.texturing import SAMPLES, shade_textured
+        from .kernels.texturing import SAMPLES, shade_textured
 
         finer = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
         nearest, projection = self._rasterize(finer, T_world_camera)
@@ -82,7 +82,7 @@ class TexturedScene:
     def _rasterize(self, camera: PinholeCamera, T_world_camera: NDArray) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Depth buffer (H, W) and projection (3, 4) as in kernels/raster.py."""
         on_device = self._on_device
-        from ..kernels.raster import rasterize
+        from .kernels.raster import rasterize
 
         projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(check_rigid(T_world_camera))[:3])
         nearest = np.empty((camera.height, camera.width), np.int64)
@@ -94,7 +94,7 @@ class TexturedScene:
         nearest, _ = self._rasterize(camera, T_world_camera)
         import taichi as ti
 
-        from ..kernels.texturing import read_surfaces
+        from .kernels.texturing import read_surfaces
 
         depth, cosine = (np.empty(nearest.shape, np.float32) for _ in range(2))
         objects = np.empty(nearest.shape, np.int32)

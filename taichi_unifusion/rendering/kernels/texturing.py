@@ -8,7 +8,7 @@ triangles nor at their edges.
 import taichi as ti
 
 from .raster import EMPTY, DepthBuffer, Projection, depth_of, edge_functions, project
-from .voxels import Floats2, Ints1, Ints2, row3
+from ...kernels.voxels import Floats2, Ints1, Ints2, row3
 
 MAX_TAPS = 8       # along the long axis of a footprint; longer ones are blurred
 SLACK = 0.05       # of a tap: a footprint that is square but for rounding takes one

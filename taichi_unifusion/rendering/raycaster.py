@@ -54,7 +54,7 @@ class RayCaster:
         """What every pixel of the camera sees; raises PoseError for a pose that is no rigid transform."""
         T_world_camera = check_rigid(T_world_camera)
         runtime.current()  # before Taichi is imported: it says what it starts
-        from ..kernels.raster import EMPTY, rasterize
+        from .kernels.raster import EMPTY, rasterize
 
         projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(T_world_camera)[:3])
         nearest = np.empty((camera.height, camera.width), np.int64)

@@ -5,7 +5,7 @@ A colour depends on the surface point and its normal alone, never on the view, s
 
 import taichi as ti
 
-from .raycast import CYLINDER, ROOM, SPHERE, TAU, multiply, to_local, uniform
+from .solids import CYLINDER, ROOM, SPHERE, TAU, multiply, to_local, uniform
 
 PATTERNS = {name: i for i, name in enumerate(
     ("plain", "planks", "wallpaper", "weave", "bands", "landscape", "mosaic", "rug", "panels", "globe"))}

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.raycast import BOX, CYLINDER, ROOM, SPHERE
+from .kernels.solids import BOX, CYLINDER, ROOM, SPHERE
 from ..types import Mesh
 
 CHORD_ERROR = 1.5e-4  # [m] largest distance of the tessellated from the true surface

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..kernels.raycast import ROOM
+from .kernels.solids import ROOM
 from .primitives import Primitive, box, cylinder, ellipsoid, place, rotation
 
 ROOM_SIZE = (5.0, 4.0, 2.6)  # [m]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Mesh
-from .base import Look
+from ..properties.base import Look
 from .colormaps import color_table, colorize
 
 MOST = (1.0, 99.0)   # percentiles of the values that a colour map covers where a property states no range

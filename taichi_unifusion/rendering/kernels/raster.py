@@ -7,7 +7,7 @@ The depth buffer holds depth and triangle in one integer, so that the result doe
 
 import taichi as ti
 
-from .voxels import Floats2, Ints2, row3
+from ...kernels.voxels import Floats2, Ints2, row3
 
 EMPTY = (1 << 63) - 1  # depth buffer value where no triangle is seen
 EDGE = 1e-7            # barycentric slack: pixels on a shared edge belong to both triangles, never to none

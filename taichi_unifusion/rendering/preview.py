@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from . import runtime
-from .errors import InputError
-from .files.atomic import atomic_write
-from .types import Mesh, PinholeCamera, Trajectory, check_rigid
+from .. import runtime
+from ..errors import InputError
+from ..files.atomic import atomic_write
+from ..types import Mesh, PinholeCamera, Trajectory, check_rigid
 
 VIEWS = {  # name -> what it shows
     "camera": "from a camera of the recording, drawn back a little",

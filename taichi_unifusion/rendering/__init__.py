@@ -1,0 +1,1 @@
+"""Triangles and solids to pictures: previews, legends, ray casting, rendered rooms."""

@@ -1,0 +1,1 @@
+"""Kernels of pictures; those of the method lie in `taichi_unifusion.kernels`."""
