@@ -12,9 +12,10 @@ transformers = pytest.importorskip("transformers", reason="needs transformers: p
 
 from taichi_unifusion import Frame, PinholeCamera  # noqa: E402
 from taichi_unifusion.errors import FileError, FrameError, InputError  # noqa: E402
-from taichi_unifusion.language import clip, feature_image, make_image_encoder, make_text_encoder  # noqa: E402
+from taichi_unifusion.networks import clip
+from taichi_unifusion.language import feature_image, make_image_encoder, make_text_encoder  # noqa: E402
 from taichi_unifusion.language.prompts import embed  # noqa: E402
-from taichi_unifusion.language.tokenizer import _BYTE_LETTERS  # noqa: E402
+from taichi_unifusion.networks.tokenizer import _BYTE_LETTERS  # noqa: E402
 
 UNIT = 1e-5
 BATCHED = 1e-4  # sums in another order

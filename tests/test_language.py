@@ -16,7 +16,7 @@ from taichi_unifusion.language import feature_image, folder, make_image_encoder,
 from taichi_unifusion.language.embeddings import TextEmbeddings, read_embeddings
 from taichi_unifusion.language.prompts import competitors, embed, relevance
 from taichi_unifusion.language.regions import find_regions, vertex_areas
-from taichi_unifusion.language.tokenizer import ClipTokenizer
+from taichi_unifusion.networks.tokenizer import ClipTokenizer
 
 HALF = 1e-3    # half precision of stored features
 EXACT = 1e-6

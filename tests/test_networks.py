@@ -13,7 +13,7 @@ from networks import color_transform, edge_detector, mean_of_channels, not_a_num
 from taichi_unifusion import Frame, PinholeCamera
 from taichi_unifusion.errors import FileError, FrameError, InputError, MissingDependency
 from taichi_unifusion.properties import make_property
-from taichi_unifusion.properties.networks import IMAGENET_MEAN, IMAGENET_STD
+from taichi_unifusion.networks.image_network import IMAGENET_MEAN, IMAGENET_STD
 
 pytest.importorskip("onnxruntime", reason="networks are run by onnxruntime, extra 'models'")
 

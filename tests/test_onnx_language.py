@@ -10,7 +10,7 @@ import pytest
 from taichi_unifusion import Frame, PinholeCamera
 from taichi_unifusion.errors import FileError, FrameError, InputError
 from taichi_unifusion.language import feature_image, make_image_encoder, make_text_encoder, unit_length
-from taichi_unifusion.language.clip import NORMALIZATION
+from taichi_unifusion.networks.clip import NORMALIZATION
 
 onnx = pytest.importorskip("onnx", reason="writing test networks needs the package onnx")
 pytest.importorskip("onnxruntime", reason="needs onnxruntime: pip install 'taichi-unifusion[models]'")

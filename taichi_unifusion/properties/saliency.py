@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from ..errors import InputError, check_choice
 from ..types import Frame
 from .base import Look, SurfaceProperty, color_of
-from .networks import IMAGENET_MEAN, IMAGENET_STD, ImageNetwork, check_preparation, prepare
+from ..networks.image_network import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    ImageNetwork,
+    check_preparation,
+    prepare,
+)
 
 LOOK = Look("viridis", (0.0, 1.0), "saliency")
 PICTURE = 96           # pixels of the longer side: coarse, so that objects count and not their texture

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..types import Frame
 from .base import Look, SurfaceProperty, color_of
-from .networks import ImageNetwork, check_preparation, prepare
+from ..networks.image_network import ImageNetwork, check_preparation, prepare
 
 LOOK = Look()
 CONTOUR_WIDTH = 2.0  # [pixels]

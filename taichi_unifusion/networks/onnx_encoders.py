@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError, InputError
-from ..onnx_session import open_session, run_session
+from .onnx_session import open_session, run_session
 from ..types import Frame
-from . import unit_length
+from ..language import unit_length
 from .clip import NORMALIZATION, SHORT_SIDE
 from .tokenizer import ClipTokenizer
 

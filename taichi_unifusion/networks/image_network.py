@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, FrameError, InputError, check_choice
 from ..files.atomic import read_bytes
-from ..onnx_session import open_session, run_session
+from .onnx_session import open_session, run_session
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .errors import FileError, InputError, MissingDependency, check_choice
+from ..errors import FileError, InputError, MissingDependency, check_choice
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
