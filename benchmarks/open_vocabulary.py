@@ -114,7 +114,7 @@ def run(options: argparse.Namespace) -> None:
     test = HeldOut(test.points[known], test.labels[known], test.objects[known])
     print(table_of_answers(pipeline.features, averages, test, texts, names), "\n", flush=True)
     if options.out:
-        from taichi_unifusion.results import write_results
+        from taichi_unifusion.results.writer import write_results
 
         write_results(options.out, pipeline, result)
     print(table_of_memory(pipeline.features, variants, test, texts, names), "\n", flush=True)

@@ -21,7 +21,8 @@ import pytest
 from tiny_recording import CONFIG, DEVICE, FLAGS, make_frames, write_folder
 
 import taichi_unifusion as uf
-from taichi_unifusion import cli, results
+from taichi_unifusion import cli
+from taichi_unifusion.results import writer as results
 from taichi_unifusion.commands.info import Info
 from taichi_unifusion.config import Config, dump_config, load_config
 from taichi_unifusion.files.atomic import read_mesh, read_trajectory

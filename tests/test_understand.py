@@ -12,7 +12,7 @@ from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 from taichi_unifusion import Pipeline, cli, load_map
 from taichi_unifusion.files.atomic import read_mesh
 from taichi_unifusion.maps import LatentMap
-from taichi_unifusion.results import write_results
+from taichi_unifusion.results.writer import write_results
 
 COLORS = np.eye(3)  # names are directions of colour here: what is red is "red"
 NAMES = ("red", "green", "blue")

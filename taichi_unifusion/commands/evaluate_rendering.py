@@ -19,7 +19,7 @@ from .scores import ScoreOptions, cell, percent
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..evaluation.runs import Run
+    from ..results.reader import Run
     from ..types import Frame
 
 logger = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     from ..files.foreign_meshes import read_any_mesh
     from ..evaluation.rendering import WITHIN
     from ..evaluation.rendering import evaluate_rendering as evaluate
-    from ..evaluation.runs import find_run
+    from ..results.reader import find_run
 
     run = find_run(options.reconstruction)
     mesh = run.mesh() if run else read_any_mesh(options.reconstruction)

@@ -51,7 +51,7 @@ def evaluate_surface(options: EvaluateSurface) -> int:
     from .. import runtime
     from ..geometry.triangles import transformed
     from ..files.foreign_meshes import read_any_mesh
-    from ..evaluation.runs import find_run, read_run
+    from ..results.reader import find_run, read_run
     from ..evaluation.surface import evaluate_surface as evaluate
 
     run = find_run(options.reconstruction)

@@ -63,7 +63,7 @@ def evaluate_trajectory(options: EvaluateTrajectory) -> int:
 
 
 def _read(options: EvaluateTrajectory) -> tuple[Trajectory, Trajectory]:
-    from ..evaluation.runs import find_run
+    from ..results.reader import find_run
     from ..files.atomic import read_trajectory
 
     run = find_run(options.estimate)

@@ -21,7 +21,7 @@ class Info:
 
 def info(options: Info) -> int:
     """Files -> tables."""
-    from ..inspection import inspect
+    from ..results.inspection import inspect
 
     inspection = inspect(options.path)
     if inspection.text:

@@ -49,7 +49,7 @@ def extract_mesh(options: ExtractMesh) -> int:
     mesh = pipeline.extract_mesh(surface, properties, options.resolution, options.min_area)
     meshes = {file: mesh for file in files}
     if not options.out:
-        from ..results import property_meshes
+        from ..results.writer import property_meshes
 
         meshes.update(property_meshes(options.dir, mesh))
     failures = []

@@ -48,7 +48,7 @@ def query(options: Query) -> int:
         raise InputError("query: say what to look for, for example: unifusion query results/flat \"sofa\"")
     from ..files.atomic import check_writable, write_text
     from ..language.questions import ask
-    from ..results import ResultsFolder
+    from ..results.writer import ResultsFolder
 
     understood = read_understood(options.dir, options.device)
     folder = ResultsFolder(check_writable(options.dir))

@@ -56,7 +56,7 @@ def reconstruct(options: Reconstruct, encoder: ImageEncoder | None = None) -> in
     """Frames -> maps -> mesh -> results folder; with an image encoder also a map of its features."""
     frames = options.frames()
     options.check_poses(frames)
-    from ..results import prepare_results, remove_temporaries
+    from ..results.writer import prepare_results, remove_temporaries
 
     directory = prepare_results(options.out)
     with stop_on_signal(clean_up=lambda: remove_temporaries(directory)) as stop:
@@ -66,7 +66,7 @@ def reconstruct(options: Reconstruct, encoder: ImageEncoder | None = None) -> in
 def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop: Callable[[], bool],
                    encoder: ImageEncoder | None) -> int:
     from ..pipeline import Pipeline
-    from ..results import TRACKING_FILES, write_results
+    from ..results.writer import TRACKING_FILES, write_results
 
     about, written = {"recording": {**options.about, "frames": len(frames)}}, []
     if options.tracked:

@@ -39,7 +39,7 @@ def segment(options: Segment) -> int:
     from ..language.pictures import label_colors, label_mesh, segmentation_picture
     from ..language.questions import segment as segment_points
     from ..rendering.preview import write_png
-    from ..results import ResultsFolder
+    from ..results.writer import ResultsFolder
 
     truth = _read_truth(options.truth) if options.truth else None
     understood = read_understood(options.dir, options.device)

@@ -51,7 +51,7 @@ class TrackingOptions:
         """
         from .. import runtime
         from ..files.atomic import write_trajectory
-        from ..results import TRACKING_FILES
+        from ..results.writer import TRACKING_FILES
         from ..tracking import make_tracker
         from ..tracking.sequence import PosedFrames, track_sequence, write_tracking
 

@@ -17,8 +17,8 @@ from ..datasets import Dataset, open_dataset
 from ..errors import DatasetError, FileError, FrameError
 from ..files.atomic import read_bytes, read_mesh, read_trajectory
 from ..types import Mesh, Trajectory
-from .trajectory import align_poses, match_poses
-from .visibility import Views
+from ..evaluation.trajectory import align_poses, match_poses
+from ..evaluation.visibility import Views
 
 logger = logging.getLogger(__name__)
 

@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from . import __version__, runtime
-from .config import dump_config
-from .errors import FileError, InputError
-from .files.atomic import check_writable, write_mesh, write_text, write_trajectory
-from .pipeline import FEATURES, Pipeline
-from .rendering.preview import draw_preview, render_preview, write_png
-from .properties.base import Look
-from .rendering.legend import draw_legend, property_mesh, shown_range
-from .run_log import RunResult, StepResult
-from .types import Mesh, Trajectory
+from .. import __version__, runtime
+from ..config import dump_config
+from ..errors import FileError, InputError
+from ..files.atomic import check_writable, write_mesh, write_text, write_trajectory
+from ..pipeline import FEATURES, Pipeline
+from ..rendering.preview import draw_preview, render_preview, write_png
+from ..properties.base import Look
+from ..rendering.legend import draw_legend, property_mesh, shown_range
+from ..run_log import RunResult, StepResult
+from ..types import Mesh, Trajectory
 
 logger = logging.getLogger(__name__)
 
