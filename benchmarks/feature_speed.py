@@ -14,7 +14,7 @@ from taichi_unifusion.language import unit_length
 from taichi_unifusion.language.embeddings import TextEmbeddings
 from taichi_unifusion.language.questions import ask
 from taichi_unifusion.maps import LatentMap
-from taichi_unifusion.terminal import format_table
+from taichi_unifusion.cli.terminal import format_table
 from taichi_unifusion.types import Mesh
 
 FEATURES = 60, 80      # feature pixels of a frame

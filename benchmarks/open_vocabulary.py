@@ -27,7 +27,7 @@ from taichi_unifusion.evaluation.segmentation import evaluate_segmentation
 from taichi_unifusion.language.embeddings import TextEmbeddings, read_embeddings
 from taichi_unifusion.language.questions import ask
 from taichi_unifusion.maps import LatentMap
-from taichi_unifusion.terminal import format_table
+from taichi_unifusion.cli.terminal import format_table
 from taichi_unifusion.types import Mesh
 
 AVERAGED = (0.2, 0.1, 0.07, 0.05)  # [m] voxels of the averages

@@ -21,9 +21,9 @@ import pytest
 from tiny_recording import CONFIG, DEVICE, FLAGS, make_frames, write_folder
 
 import taichi_unifusion as uf
-from taichi_unifusion import cli
+from taichi_unifusion.cli import main as cli
 from taichi_unifusion.results import writer as results
-from taichi_unifusion.commands.info import Info
+from taichi_unifusion.cli.info import Info
 from taichi_unifusion.config import Config, dump_config, load_config
 from taichi_unifusion.files.atomic import read_mesh, read_trajectory
 from taichi_unifusion.files.maps import read_map

@@ -11,7 +11,8 @@ import pytest
 from meshes import joined, mesh_of, random_rigid, rectangle
 from tiny_recording import FLAGS, make_frames, write_folder
 
-from taichi_unifusion import Trajectory, cli, load_map, open_dataset
+from taichi_unifusion import Trajectory, load_map, open_dataset
+from taichi_unifusion.cli import main as cli
 from taichi_unifusion.errors import FileError
 from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
 from taichi_unifusion.geometry import triangles as geometry

@@ -10,7 +10,7 @@ import pytest
 from dataset_writers import make_samples, write_replica
 from tiny_recording import FLAGS
 
-from taichi_unifusion import cli
+from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.files.atomic import read_trajectory, write_trajectory
 from taichi_unifusion.results.writer import TRACKING_FILES

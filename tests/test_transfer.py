@@ -14,7 +14,8 @@ import pytest
 from networks import edge_detector, not_a_number
 from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 
-from taichi_unifusion import Pipeline, PropertyMap, cli
+from taichi_unifusion import Pipeline, PropertyMap
+from taichi_unifusion.cli import main as cli
 from taichi_unifusion.config import dump_config, load_config
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.files.atomic import read_mesh

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 
-from taichi_unifusion import Pipeline, cli, load_map
+from taichi_unifusion import Pipeline, load_map
+from taichi_unifusion.cli import main as cli
 from taichi_unifusion.files.atomic import read_mesh
 from taichi_unifusion.maps import LatentMap
 from taichi_unifusion.results.writer import write_results

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..errors import FileError, MapCorrupt, UniFusionError
 from ..files.atomic import read_bytes, read_mesh
 from ..files.maps import read_map
-from ..terminal import format_bytes, format_table
+from ..cli.terminal import format_bytes, format_table
 
 MAP_COLUMNS = ["map", "kind", "voxels", "voxel size", "file", "encoder", "fusion", "version"]
 

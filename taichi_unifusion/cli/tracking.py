@@ -13,7 +13,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 from ..config import Config
 from ..datasets import Dataset
 from ..errors import DatasetError
-from ..terminal import frame_progress
+from .terminal import frame_progress
 from .recording import RecordingOptions
 
 logger = logging.getLogger(__name__)

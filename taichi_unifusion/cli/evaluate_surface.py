@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..errors import InputError
-from ..terminal import format_table
+from .terminal import format_table
 from .scores import ScoreOptions, cell, percent
 
 

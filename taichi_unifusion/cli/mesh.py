@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from ..config import MeshSettings
 from ..errors import FileError, InputError, UniFusionError
-from ..terminal import format_bytes, report
+from .terminal import format_bytes, report
 
 
 @dataclass(frozen=True)

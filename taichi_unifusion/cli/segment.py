@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from ..errors import InputError
-from ..terminal import format_table, report
+from .terminal import format_table, report
 from .texts import TextOptions, read_understood
 
 

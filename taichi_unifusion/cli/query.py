@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..terminal import format_table, report
+from .terminal import format_table, report
 from .texts import TextOptions, read_understood
 
 if TYPE_CHECKING:

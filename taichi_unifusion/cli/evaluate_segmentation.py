@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
-from ..terminal import format_table
+from .terminal import format_table
 from .scores import ScoreOptions, percent
 
 if TYPE_CHECKING:

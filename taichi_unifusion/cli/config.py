@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from ..config import Config, dump_config
-from ..terminal import DONE
+from .terminal import DONE
 
 
 @dataclass(frozen=True)

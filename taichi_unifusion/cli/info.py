@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ..terminal import report
+from .terminal import report
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from ..terminal import DONE
+from .terminal import DONE
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
-from ..terminal import format_table
+from .terminal import format_table
 from .scores import ScoreOptions, cell
 
 if TYPE_CHECKING:

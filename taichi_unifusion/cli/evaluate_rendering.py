@@ -12,7 +12,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..datasets import Dataset, open_dataset
 from ..errors import DatasetError, FrameError, InputError
-from ..terminal import format_table, frame_progress
+from .terminal import format_table, frame_progress
 from .recording import FORMAT_DEFAULT
 from .scores import ScoreOptions, cell, percent
 

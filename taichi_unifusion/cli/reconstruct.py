@@ -13,8 +13,8 @@ from tyro.conf import FlagCreatePairsOff, arg
 
 from ..config import Config
 from ..datasets import Dataset
-from ..interrupts import INTERRUPTED, stop_on_signal
-from ..terminal import frame_progress, report, summarize
+from .interrupts import INTERRUPTED, stop_on_signal
+from .terminal import frame_progress, report, summarize
 from .recording import RecordingOptions
 from .tracking import TrackingOptions
 

@@ -18,17 +18,17 @@ from typing import Annotated, Union
 import tyro
 from tyro.conf import subcommand
 
-from .commands.config import ShowConfig, show_config
-from .commands.evaluate import METRICS, Evaluate
-from .commands.info import Info, info
-from .commands.mesh import ExtractMesh, extract_mesh
-from .commands.query import Query, query
-from .commands.reconstruct import Reconstruct, reconstruct
-from .commands.segment import Segment, segment
-from .commands.transfer import Transfer, transfer
-from .commands.understand import Understand, understand
-from .config import Config, load_config
-from .errors import FileError, UniFusionError
+from .config import ShowConfig, show_config
+from .evaluate import METRICS, Evaluate
+from .info import Info, info
+from .mesh import ExtractMesh, extract_mesh
+from .query import Query, query
+from .reconstruct import Reconstruct, reconstruct
+from .segment import Segment, segment
+from .transfer import Transfer, transfer
+from .understand import Understand, understand
+from ..config import Config, load_config
+from ..errors import FileError, UniFusionError
 from .interrupts import INTERRUPTED
 from .terminal import DONE, FAILED, log_to_stderr, report
 
@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _dispatch(argv: list[str]) -> int:
     if argv == ["--version"]:
-        from . import __version__
+        from .. import __version__
 
         print(f"unifusion {__version__}")
         return DONE

@@ -1,0 +1,1 @@
+"""`unifusion`: one file a command."""
