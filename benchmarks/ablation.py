@@ -23,7 +23,7 @@ from quality_methods import PAPER
 from quality_scenes import DEPTH_RANGE, SCENES, Scene
 
 import taichi_unifusion as uf
-from taichi_unifusion.encoding import EncoderSettings, PositionEncoding
+from taichi_unifusion.maps.encoding import EncoderSettings, PositionEncoding
 from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
 from taichi_unifusion.rendering.preview import View, render_mesh
 from taichi_unifusion.types import Mesh

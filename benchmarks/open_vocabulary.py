@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import taichi_unifusion as uf
 from taichi_unifusion.datasets.scene import SceneDataset
-from taichi_unifusion.encoding import EncoderSettings
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.evaluation.segmentation import evaluate_segmentation
 from taichi_unifusion.language.embeddings import TextEmbeddings, read_embeddings
 from taichi_unifusion.language.questions import ask

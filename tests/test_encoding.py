@@ -7,7 +7,12 @@ import pytest
 import reference
 from scipy.special import gamma, kv
 
-from taichi_unifusion.encoding import EncoderSettings, PositionEncoding, matern72, position_encoding
+from taichi_unifusion.maps.encoding import (
+    EncoderSettings,
+    PositionEncoding,
+    matern72,
+    position_encoding,
+)
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.kernels import encoding as kernels
 

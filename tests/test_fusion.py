@@ -10,7 +10,7 @@ from test_map_laws import KINDS, answers, frames, integrated
 from test_regression import LATENT, assert_equal_maps, encoder_of, in_voxels
 
 from taichi_unifusion import PropertyMap, SurfaceMap, load_map
-from taichi_unifusion.encoding import EncoderSettings
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.errors import MapCorrupt, OutOfRange
 from taichi_unifusion.kernels import fusion
 from taichi_unifusion.files.maps import read_map, write_map

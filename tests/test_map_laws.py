@@ -12,7 +12,7 @@ from conftest import DEVICE
 from scenes import cloud_of, moved, rough, taken
 
 from taichi_unifusion import PropertyMap, SurfaceMap, load_map, runtime
-from taichi_unifusion.encoding import EncoderSettings
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.errors import CapacityError, InputError, MapCorrupt, OutOfRange, RuntimeStateError
 from taichi_unifusion.maps import voxel_grid
 

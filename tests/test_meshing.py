@@ -9,11 +9,11 @@ import pytest
 import reference
 from skimage.measure import marching_cubes
 
-from taichi_unifusion import meshing
+from taichi_unifusion.maps import meshing
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.kernels import marching_cubes as kernels
 from taichi_unifusion.maps import SurfaceMap
-from taichi_unifusion.meshing import drop_small_parts
+from taichi_unifusion.maps.meshing import drop_small_parts
 from taichi_unifusion.types import Mesh
 
 R = 4                  # samples a cube edge in these tests

@@ -7,7 +7,7 @@ import pytest
 from scenes import cloud_of, rough
 
 from taichi_unifusion import PointCloud, PropertyMap, load_map
-from taichi_unifusion.encoding import EncoderSettings
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.errors import CapacityError, InputError
 from taichi_unifusion.maps import PropertyGroup
 from taichi_unifusion.maps.frame_blocks import FrameBlocks

@@ -7,14 +7,14 @@ import pytest
 import reference
 
 from taichi_unifusion import runtime
-from taichi_unifusion.encoding import EncoderSettings
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.errors import InputError, RuntimeStateError
 from taichi_unifusion.kernels import query as kernels
 from taichi_unifusion.kernels.voxels import INDEX_HALF
 from taichi_unifusion.maps import PropertyMap, SurfaceMap
 from taichi_unifusion.maps.property_map import NEAREST_REACH
 from taichi_unifusion.maps.voxel_grid import VoxelGrid
-from taichi_unifusion.meshing import STEPS, grid_basis
+from taichi_unifusion.maps.meshing import STEPS, grid_basis
 
 SETTINGS = dict(encoder=EncoderSettings(rank=6, anchors=64), voxel_size=0.05)
 ENCODER = reference.Encoder(6, 64)

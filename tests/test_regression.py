@@ -7,7 +7,7 @@ import pytest
 import reference
 from scenes import rough
 
-from taichi_unifusion.encoding import EncoderSettings
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.kernels import fusion
 from taichi_unifusion.kernels.regression import TILE
 from taichi_unifusion.maps import PropertyMap, SurfaceMap

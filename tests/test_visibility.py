@@ -8,7 +8,7 @@ import reference
 import reference_visibility as twin
 
 from taichi_unifusion import PinholeCamera, SurfaceMap
-from taichi_unifusion.encoding import EncoderSettings
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.kernels import visibility as kernels
 from taichi_unifusion.maps.voxel_grid import VoxelGrid
 

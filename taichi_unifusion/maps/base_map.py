@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..encoding import EncoderSettings
+from .encoding import EncoderSettings
 from ..errors import InputError, MapCorrupt
 from ..kernels import visibility, voxels
 from ..files.maps import read_map, write_map

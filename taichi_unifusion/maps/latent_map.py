@@ -10,7 +10,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..encoding import position_encoding
+from .encoding import position_encoding
 from ..errors import FrameError, InputError
 from ..kernels import fusion, regression
 from ..kernels import latent as kernels

@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from ..encoding import position_encoding
+from .encoding import position_encoding
 from ..errors import InputError
 from ..kernels import fusion, query
 from ..kernels import regression as kernels

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ..encoding import EncoderSettings
+from .encoding import EncoderSettings
 from ..errors import InputError, check_choice
 
 MAX_LATENT_RANK = 20  # of a map of features: its kernels unroll over it

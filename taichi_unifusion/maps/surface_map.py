@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..errors import InputError
 from ..kernels import visibility
-from ..meshing import drop_small_parts, extract_mesh
+from .meshing import drop_small_parts, extract_mesh
 from ..types import Mesh, PointCloud
 from .base_map import BaseMap
 from .frame_blocks import FrameBlocks

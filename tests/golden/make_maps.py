@@ -18,7 +18,7 @@ import numpy as np
 from safetensors.numpy import load_file
 
 import taichi_unifusion as uf
-from taichi_unifusion.encoding import EncoderSettings, position_encoding
+from taichi_unifusion.maps.encoding import EncoderSettings, position_encoding
 from taichi_unifusion.maps import LatentMap, PropertyGroup
 
 FRAMES = (0, 2)  # of a loop of 60: most of what one sees, the other sees too

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from . import runtime
+from .. import runtime
 from .encoding import PositionEncoding
-from .kernels import marching_cubes as kernels
-from .kernels import query
-from .kernels.visibility import interpolate_evidence
-from .types import Mesh
+from ..kernels import marching_cubes as kernels
+from ..kernels import query
+from ..kernels.visibility import interpolate_evidence
+from ..types import Mesh
 
 if TYPE_CHECKING:
-    from .maps.voxel_grid import VoxelGrid
+    from .voxel_grid import VoxelGrid
 
 STEPS = np.array(list(product((0, 1), repeat=3)))  # (8, 3) corners of a cube, x slowest
 SNAP = 1e-4                                        # of an edge: a cut this near to a vertex goes through it
