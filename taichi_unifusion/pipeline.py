@@ -13,7 +13,7 @@ from . import runtime
 from .config import Config
 from .errors import FrameError, InputError, PoseError, UniFusionError
 from .language import ImageEncoder, feature_image
-from .loading import load_ahead
+from .datasets.loading import load_ahead
 from .maps import BaseMap, LatentMap, PropertyMap, SurfaceMap
 from .maps.property_group import group_maps
 from .preprocessing import PreprocessSettings, preprocess

@@ -13,7 +13,7 @@ import numpy as np
 from .datasets.checks import guess_depth_scale
 from .datasets.pose_convention import guess_pose_convention, has_moved
 from .errors import DatasetError, FrameError, OutOfRange, PoseError, SizeMismatch, UniFusionError
-from .loading import index_in_recording, recording_of
+from .datasets.loading import index_in_recording, recording_of
 from .maps import Integration
 from .types import Frame, Trajectory
 

@@ -13,7 +13,7 @@ from tiny_recording import CONFIG, make_frames, write_folder
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.errors import DatasetError, FrameError, OutOfRange, PoseError
-from taichi_unifusion.loading import load_ahead
+from taichi_unifusion.datasets.loading import load_ahead
 from taichi_unifusion.maps import Integration
 from taichi_unifusion.pipeline import Pipeline, extract_mesh
 from taichi_unifusion.preprocessing import PreprocessSettings

@@ -13,7 +13,7 @@ from pathlib import Path
 from ..datasets import Dataset, DatasetView
 from ..errors import FrameError, PoseError
 from ..files.atomic import atomic_write
-from ..loading import index_in_recording, load_ahead
+from ..datasets.loading import index_in_recording, load_ahead
 from ..run_log import name_of
 from ..types import Frame
 from .base import TrackedFrame, Tracker, TrackingResult, Verdict

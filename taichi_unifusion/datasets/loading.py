@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-from .datasets import DatasetView
-from .types import Frame
+from . import DatasetView
+from ..types import Frame
 
 
 def load_ahead(sequence: Sequence[Frame]) -> Iterator[Callable[[], Frame]]:
