@@ -21,7 +21,7 @@ from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.scene import SceneDataset
 from taichi_unifusion.datasets.synthetic import FRAME_RATE, look_at
 from taichi_unifusion.errors import InputError
-from taichi_unifusion.files.atomic import write_trajectory
+from taichi_unifusion.files.trajectories import write_trajectory
 from taichi_unifusion.types import Trajectory
 
 STEP, TURN = 0.045, 2.5      # [m], [degrees] between frames, at most

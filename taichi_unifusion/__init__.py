@@ -6,8 +6,9 @@ Names load when they are first used, so that `import taichi_unifusion` is quick 
 from __future__ import annotations
 
 import os
-from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import lazy_loader
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read by Taichi's first import, wherever that happens
 
@@ -23,32 +24,31 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_MODULES = {
-    "init": "runtime", "open_dataset": "datasets", "preprocess": "preprocessing",
-    "SurfaceMap": "maps", "PropertyMap": "maps", "load_map": "maps",
-    "Frame": "types", "PinholeCamera": "types", "PointCloud": "types", "Mesh": "types", "Trajectory": "types",
-    "Pipeline": "pipeline", "Config": "config", "load_config": "config", "UniFusionError": "errors",
-}
-
 __all__ = ["Config", "Frame", "Mesh", "PinholeCamera", "Pipeline", "PointCloud", "PropertyMap", "SurfaceMap", "Trajectory",
            "UniFusionError", "__version__", "init", "load_config", "load_map", "open_dataset", "preprocess"]
 
 
-def __getattr__(name: str):
-    if name == "__version__":
-        from importlib.metadata import PackageNotFoundError, version
+_load, __dir__, _ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "runtime": ["init"],
+        "datasets": ["open_dataset"],
+        "preprocessing": ["preprocess"],
+        "maps": ["SurfaceMap", "PropertyMap", "load_map"],
+        "types": ["Frame", "PinholeCamera", "PointCloud", "Mesh", "Trajectory"],
+        "pipeline": ["Pipeline"],
+        "config": ["Config", "load_config"],
+        "errors": ["UniFusionError"],
+    },
+)
 
-        try:
-            value = version("taichi-unifusion")
-        except PackageNotFoundError:  # the source tree on the path, not installed
-            value = "0+unknown"
-    elif name in _MODULES:
-        value = getattr(import_module(f".{_MODULES[name]}", __name__), name)
-    else:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    globals()[name] = value
-    return value
 
+def __getattr__(name: str) -> Any:
+    if name != "__version__":
+        return _load(name)
+    from importlib.metadata import PackageNotFoundError, version
 
-def __dir__() -> list[str]:
-    return __all__
+    try:
+        return version("taichi-unifusion")
+    except PackageNotFoundError:  # the source tree on the path, not installed
+        return "0+unknown"

@@ -237,7 +237,7 @@ class Mesh:
 
     def save(self, path) -> None:
         """Write the mesh; the suffix chooses PLY, GLB or OBJ."""
-        from .files.atomic import write_mesh
+        from .files.meshes import write_mesh
 
         write_mesh(path, self)
 

@@ -64,7 +64,7 @@ def evaluate_trajectory(options: EvaluateTrajectory) -> int:
 
 def _read(options: EvaluateTrajectory) -> tuple[Trajectory, Trajectory]:
     from ..results.reader import find_run
-    from ..files.atomic import read_trajectory
+    from ..files.trajectories import read_trajectory
 
     run = find_run(options.estimate)
     if run is None and options.ground_truth is None:

@@ -31,7 +31,8 @@ class ExtractMesh:
 
 def extract_mesh(options: ExtractMesh) -> int:
     """Saved maps -> mesh files, those of single properties included."""
-    from ..files.atomic import MESH_SUFFIXES, check_writable, write_mesh
+    from ..files.atomic import check_writable
+    from ..files.meshes import MESH_SUFFIXES, write_mesh
 
     files = [options.out] if options.out else [options.dir / "mesh.ply", options.dir / "mesh.glb"]
     if files[0].suffix.lower() not in MESH_SUFFIXES:

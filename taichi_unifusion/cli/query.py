@@ -55,7 +55,7 @@ def query(options: Query) -> int:
     encoder = options.encoder(understood.features.settings.source)
     answers = ask(understood.features, understood.mesh, encoder, options.texts, negatives=options.negative,
                   threshold=options.threshold, min_area=options.min_area, templates=options.templates)
-    from ..files.atomic import write_mesh
+    from ..files.meshes import write_mesh
     from ..language.pictures import cameras_that_see, heat_mesh
     from ..rendering.preview import render_preview
 

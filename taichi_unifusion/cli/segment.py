@@ -35,7 +35,8 @@ class Segment(TextOptions):
 def segment(options: Segment) -> int:
     """Names -> labelled mesh, picture, scores."""
     names = read_labels_file(options.labels)
-    from ..files.atomic import check_writable, write_mesh, write_text
+    from ..files.atomic import check_writable, write_text
+    from ..files.meshes import write_mesh
     from ..language.pictures import label_colors, label_mesh, segmentation_picture
     from ..language.questions import segment as segment_points
     from ..rendering.preview import write_png
@@ -85,7 +86,7 @@ def read_labels_file(path: Path) -> dict[int, str]:
 
 
 def _read_truth(path: Path) -> Any:
-    from ..files.atomic import read_mesh
+    from ..files.meshes import read_mesh
 
     mesh = read_mesh(path)
     if "label" not in mesh.attributes:

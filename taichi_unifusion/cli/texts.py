@@ -73,7 +73,8 @@ class Understood:
 def read_understood(directory: Path, device: str) -> Understood:
     """Mesh, map of features and trajectory of a results folder; raises FileError where one is missing or damaged."""
     from .. import runtime
-    from ..files.atomic import read_mesh, read_trajectory
+    from ..files.trajectories import read_trajectory
+    from ..files.meshes import read_mesh
     from ..maps import LatentMap
 
     file, mesh_file, poses = directory / "maps" / "features.safetensors", directory / "mesh.ply", directory / "trajectory.txt"

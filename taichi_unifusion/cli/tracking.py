@@ -50,7 +50,7 @@ class TrackingOptions:
         Poses are written to tracking.csv and tracking.txt at once, so that they outlive whatever comes after.
         """
         from .. import runtime
-        from ..files.atomic import write_trajectory
+        from ..files.trajectories import write_trajectory
         from ..results.writer import TRACKING_FILES
         from ..tracking import make_tracker
         from ..tracking.sequence import PosedFrames, track_sequence, write_tracking

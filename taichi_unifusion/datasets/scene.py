@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import DatasetError, InputError
-from ..files.atomic import read_trajectory
+from ..files.trajectories import read_trajectory
 from ..types import Frame, Mesh, PinholeCamera, Trajectory
 from .base import Dataset
 from .synthetic import FOCAL_PER_WIDTH

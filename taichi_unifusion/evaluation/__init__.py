@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..lazy_names import lazy_names
+import lazy_loader
 
 if TYPE_CHECKING:
     from .rendering import RenderingResult, evaluate_rendering
@@ -13,13 +13,15 @@ if TYPE_CHECKING:
     from .trajectory import TrajectoryResult, evaluate_trajectory
     from .visibility import Views
 
-_MODULES = {
-    "SurfaceResult": "surface", "evaluate_surface": "surface", "Views": "visibility",
-    "RenderingResult": "rendering", "evaluate_rendering": "rendering",
-    "TrajectoryResult": "trajectory", "evaluate_trajectory": "trajectory",
-    "SegmentationResult": "segmentation", "evaluate_segmentation": "segmentation", "transfer_labels": "segmentation",
-}
+__all__ = ["SurfaceResult", "evaluate_surface", "Views", "RenderingResult", "evaluate_rendering", "TrajectoryResult", "evaluate_trajectory", "SegmentationResult", "evaluate_segmentation", "transfer_labels"]
 
-__all__ = list(_MODULES)
-
-__getattr__, __dir__ = lazy_names(__name__, _MODULES, __all__)
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "surface": ["SurfaceResult", "evaluate_surface"],
+        "visibility": ["Views"],
+        "rendering": ["RenderingResult", "evaluate_rendering"],
+        "trajectory": ["TrajectoryResult", "evaluate_trajectory"],
+        "segmentation": ["SegmentationResult", "evaluate_segmentation", "transfer_labels"],
+    },
+)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FileError, InputError
-from .atomic import read_mesh
+from .meshes import read_mesh
 from ..types import Mesh
 
 SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
-from .atomic import read_bytes, read_mesh
+from .atomic import read_bytes
+from .meshes import read_mesh
 
 SUFFIXES = (".ply", ".txt", ".npy")
 

@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from ..errors import FrameError, InputError, check_choice
 from ..types import Frame
 
-IMAGE_ENCODERS = {  # name -> module here, its function, what stands after the colon
-    "clip": ("clip", "clip_image_encoder", "MODEL: a folder, or a name on the Hugging Face hub"),
-    "onnx": ("onnx", "onnx_image_encoder", "FILE.onnx"),
-    "folder": ("folder", "folder_features", "FOLDER of .npy, .npz or .pt files"),
+IMAGE_ENCODERS = {  # name -> module, its function, what stands after the colon
+    "clip": ("..networks.clip", "clip_image_encoder", "MODEL: a folder, or a name on the Hugging Face hub"),
+    "onnx": ("..networks.onnx_encoders", "onnx_image_encoder", "FILE.onnx"),
+    "folder": (".folder", "folder_features", "FOLDER of .npy, .npz or .pt files"),
 }
 TEXT_ENCODERS = {
-    "clip": ("clip", "clip_text_encoder", "MODEL: a folder, or a name on the Hugging Face hub"),
-    "onnx": ("onnx", "onnx_text_encoder", "FILE.onnx"),
-    "embeddings": ("embeddings", "read_embeddings", "FILE.npz with names and vectors, or FILE.npy beside names"),
+    "clip": ("..networks.clip", "clip_text_encoder", "MODEL: a folder, or a name on the Hugging Face hub"),
+    "onnx": ("..networks.onnx_encoders", "onnx_text_encoder", "FILE.onnx"),
+    "embeddings": (".embeddings", "read_embeddings", "FILE.npz with names and vectors, or FILE.npy beside names"),
 }
 
 
@@ -62,7 +62,7 @@ def _make(text: str, encoders: dict[str, tuple[str, str, str]], what: str, optio
     module, function, after = encoders[name]
     if not where:
         raise InputError(f"{what}: '{name}' needs more, as in {name}:{after.split(':')[0]} ({after})")
-    return getattr(import_module(f".{module}", __package__), function)(where, **options)
+    return getattr(import_module(module, __package__), function)(where, **options)
 
 
 def feature_image(encoder: ImageEncoder, frame: Frame) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..lazy_names import lazy_names
+import lazy_loader
 
 if TYPE_CHECKING:
     from .base_map import BaseMap, Integration
@@ -19,11 +19,6 @@ if TYPE_CHECKING:
 __all__ = ["BaseMap", "Integration", "LatentMap", "LatentSettings", "MapSettings", "PropertyGroup", "PropertyMap",
            "PropertySettings", "SurfaceMap", "SurfaceSettings", "load_map"]
 
-_MODULES = {"BaseMap": "base_map", "Integration": "base_map", "PropertyMap": "property_map",
-            "PropertyGroup": "property_group", "SurfaceMap": "surface_map",
-            "LatentMap": "latent_map", "LatentSettings": "settings",
-            "MapSettings": "settings", "PropertySettings": "settings", "SurfaceSettings": "settings"}
-
 
 def load_map(path: str | Path) -> BaseMap:
     """The map in a file, of whatever kind it is; raises MapCorrupt or FileError."""
@@ -32,4 +27,14 @@ def load_map(path: str | Path) -> BaseMap:
     return __getattr__("BaseMap").load(path)
 
 
-__getattr__, __dir__ = lazy_names(__name__, _MODULES, __all__)
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "base_map": ["BaseMap", "Integration"],
+        "property_map": ["PropertyMap"],
+        "property_group": ["PropertyGroup"],
+        "surface_map": ["SurfaceMap"],
+        "latent_map": ["LatentMap"],
+        "settings": ["LatentSettings", "MapSettings", "PropertySettings", "SurfaceSettings"],
+    },
+)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..lazy_names import lazy_names
+import lazy_loader
 
 if TYPE_CHECKING:
     from .base import Look, SurfaceProperty
@@ -26,6 +26,10 @@ PROPERTIES: dict[str, dict[str, tuple[str, str]]] = {  # name -> method -> modul
 
 __all__ = ["PROPERTIES", "Look", "SurfaceProperty", "make_property"]
 
-_MODULES = {"Look": "base", "SurfaceProperty": "base", "make_property": "specification"}
-
-__getattr__, __dir__ = lazy_names(__name__, _MODULES, __all__)
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "base": ["Look", "SurfaceProperty"],
+        "specification": ["make_property"],
+    },
+)

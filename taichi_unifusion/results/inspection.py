@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import FileError, MapCorrupt, UniFusionError
-from ..files.atomic import read_bytes, read_mesh
+from ..files.atomic import read_bytes
+from ..files.meshes import read_mesh
 from ..files.maps import read_map
 from ..cli.terminal import format_bytes, format_table
 

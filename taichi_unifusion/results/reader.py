@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from ..config import Config, load_config
 from ..datasets import Dataset, open_dataset
 from ..errors import DatasetError, FileError, FrameError
-from ..files.atomic import read_bytes, read_mesh, read_trajectory
+from ..files.atomic import read_bytes
+from ..files.trajectories import read_trajectory
+from ..files.meshes import read_mesh
 from ..types import Mesh, Trajectory
 from ..evaluation.trajectory import align_poses, match_poses
 from ..evaluation.visibility import Views

@@ -20,7 +20,9 @@ import numpy as np
 from .. import __version__, runtime
 from ..config import dump_config
 from ..errors import FileError, InputError
-from ..files.atomic import check_writable, write_mesh, write_text, write_trajectory
+from ..files.atomic import check_writable, write_text
+from ..files.trajectories import write_trajectory
+from ..files.meshes import write_mesh
 from ..pipeline import FEATURES, Pipeline
 from ..rendering.preview import draw_preview, render_preview, write_png
 from ..properties.base import Look

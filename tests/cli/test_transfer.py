@@ -11,14 +11,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from networks import edge_detector, not_a_number
+from tiny_networks import edge_detector, not_a_number
 from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 
 from taichi_unifusion import Pipeline, PropertyMap
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.config import dump_config, load_config
 from taichi_unifusion.errors import InputError
-from taichi_unifusion.files.atomic import read_mesh
+from taichi_unifusion.files.meshes import read_mesh
 from taichi_unifusion.properties import Look, SurfaceProperty
 from taichi_unifusion.rendering.legend import HEIGHT
 from taichi_unifusion.results.writer import write_results
@@ -27,7 +27,7 @@ CONSTANT = 1e-3  # a constant comes back everywhere where the map is valid, rims
 DECIBELS = 1.0   # by which a property may be reproduced worse than colour, at equal voxel size
 EIGHT_BITS = 0.5 / 255 + 1e-6
 STALE = ("saliency.obj", "saliency.ply")
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ MODULES = ["encoding", "voxels", "cells", "regression", "fusion", "visibility", 
 BOOKKEEPING = {"claim_slots": "test_voxels", "gather_voxels": "test_voxels", "copy_voxels": "test_voxels",
                "copy_rows": "test_voxels", "gather_rows": "test_voxels", "find_slots": "test_voxels",
                "release_slots": "test_voxels", "count_leaves": "test_voxels", "count_vertices": "test_meshing"}
-TWINS = {name for path in Path(__file__).parent.glob("reference*.py") for name in vars(import_module(path.stem))}
+TWINS = {name for path in (Path(__file__).parents[1] / "support").glob("reference*.py") for name in vars(import_module(path.stem))}
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -12,7 +12,7 @@ from tiny_recording import FLAGS
 
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
-from taichi_unifusion.files.atomic import read_trajectory, write_trajectory
+from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
 from taichi_unifusion.results.writer import TRACKING_FILES
 from taichi_unifusion.geometry import se3
 from taichi_unifusion.types import Trajectory

@@ -15,7 +15,7 @@ from taichi_unifusion.types import Mesh, PinholeCamera, Trajectory
 
 cv2 = pytest.importorskip("cv2")
 
-DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 CAMERA = PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5)
 DEPTH_TOLERANCE = 1e-5   # relative: depth is stored as float32
 EDGE_BAND = 1e-5         # barycentric: pixels so near an edge may go to either side

@@ -9,7 +9,8 @@ import pytest
 from walk import Listed, bare, first_frames, verdicts
 
 from taichi_unifusion.errors import DatasetError, InputError
-from taichi_unifusion.files.atomic import rotation_to_quaternion, write_trajectory
+from taichi_unifusion.geometry.quaternions import rotation_to_quaternion
+from taichi_unifusion.files.trajectories import write_trajectory
 from taichi_unifusion.tracking import TrackedFrame, Verdict, make_tracker
 from taichi_unifusion.geometry import se3
 from taichi_unifusion.tracking.external import gaps, interpolate

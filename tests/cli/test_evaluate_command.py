@@ -18,7 +18,8 @@ from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surf
 from taichi_unifusion.geometry import triangles as geometry
 from taichi_unifusion.files.foreign_meshes import read_any_mesh
 from taichi_unifusion.results.reader import read_run
-from taichi_unifusion.files.atomic import read_mesh, read_trajectory, write_trajectory
+from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
+from taichi_unifusion.files.meshes import read_mesh
 
 FRAMES, EVERY = 7, 3     # frames 0, 3 and 6 are used
 SAMPLES = "3000"

@@ -25,10 +25,11 @@ from taichi_unifusion.cli import main as cli
 from taichi_unifusion.results import writer as results
 from taichi_unifusion.cli.info import Info
 from taichi_unifusion.config import Config, dump_config, load_config
-from taichi_unifusion.files.atomic import read_mesh, read_trajectory
+from taichi_unifusion.files.trajectories import read_trajectory
+from taichi_unifusion.files.meshes import read_mesh
 from taichi_unifusion.files.maps import read_map
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 OUTPUTS = ["config.yaml", "maps/color.safetensors", "maps/surface.safetensors", "mesh.glb", "mesh.ply", "metrics.json",
            "preview.png", "trajectory.txt"]
 FILE_LIMIT = 20_000   # bytes; trajectory, configuration and metrics are smaller, maps, meshes and preview larger
@@ -117,7 +118,7 @@ def test_debug_shows_where_an_error_comes_from(monkeypatch):
 
 
 def test_a_reader_that_leaves_early_is_no_error():
-    code = "import sys\nfrom taichi_unifusion.cli import main\nsys.exit(main(['config', '--help']))"
+    code = "import sys\nfrom taichi_unifusion.cli.main import main\nsys.exit(main(['config', '--help']))"
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.close()
     assert process.stderr.read() == b"" and process.wait() == 0
@@ -299,7 +300,7 @@ def long_run(recording, tmp_path):
                 (folder / name / f"{i}{source.suffix}").symlink_to(source)
     shutil.copy(recording / "camera.yaml", folder)
     out = tmp_path / "out"
-    code = "import sys\nfrom taichi_unifusion.cli import main\nsys.exit(main(sys.argv[1:]))"
+    code = "import sys\nfrom taichi_unifusion.cli.main import main\nsys.exit(main(sys.argv[1:]))"
     process = subprocess.Popen([sys.executable, "-c", code, "reconstruct", "folder", str(folder), *FLAGS, "--out", str(out)],
                                cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     watchdog = threading.Timer(PATIENCE, process.kill)

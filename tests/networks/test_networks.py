@@ -8,7 +8,7 @@ import hashlib
 import cv2
 import numpy as np
 import pytest
-from networks import color_transform, edge_detector, mean_of_channels, not_a_number, open_shape, write_network
+from tiny_networks import color_transform, edge_detector, mean_of_channels, not_a_number, open_shape, write_network
 
 from taichi_unifusion import Frame, PinholeCamera
 from taichi_unifusion.errors import FileError, FrameError, InputError, MissingDependency

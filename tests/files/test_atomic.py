@@ -12,17 +12,12 @@ import numpy as np
 import pytest
 
 from taichi_unifusion.errors import DatasetError, FileError, PoseError
-from taichi_unifusion.files.atomic import (
-    atomic_write,
-    check_writable,
-    quaternion_to_rotation,
-    read_trajectory,
-    rotation_to_quaternion,
-    write_trajectory,
-)
+from taichi_unifusion.files.atomic import atomic_write, check_writable
+from taichi_unifusion.geometry.quaternions import quaternion_to_rotation, rotation_to_quaternion
+from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
 from taichi_unifusion.types import Trajectory
 
-REPO = Path(__file__).resolve().parents[1]
+REPO = Path(__file__).resolve().parents[2]
 POSE_TOLERANCE = 2e-9             # files hold 9 digits
 ROTATION_TOLERANCE = 1e-12        # float64 rounding of a few products
 
@@ -74,8 +69,8 @@ def test_R5_file_size_limit_leaves_the_old_file_and_says_why(tmp_path, name):
         import resource, sys
         import numpy as np
         from taichi_unifusion.errors import FileError
-        from taichi_unifusion.io import write_mesh
-        from taichi_unifusion.map_files import write_map
+        from taichi_unifusion.files.maps import write_map
+        from taichi_unifusion.files.meshes import write_mesh
         from taichi_unifusion.types import Mesh
 
         def write(count):
@@ -119,7 +114,7 @@ def test_R6_read_only_folder(tmp_path):
 def test_K2_io_needs_no_heavy_package():
     result = run_python("""
         import sys
-        import taichi_unifusion.io, taichi_unifusion.map_files
+        import taichi_unifusion.files.maps, taichi_unifusion.files.meshes
         print([m for m in ("taichi", "trimesh", "open3d", "torch", "cv2") if m in sys.modules])
         """)
     assert result.stdout.strip() == "[]", result.stderr

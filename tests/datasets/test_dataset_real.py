@@ -10,7 +10,7 @@ import pytest
 
 from taichi_unifusion.datasets import open_dataset
 
-DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
 
 def recording(name: str) -> Path:

@@ -11,7 +11,7 @@ from taichi_unifusion.datasets.scene import SceneDataset, kinect_camera
 from taichi_unifusion.datasets.synthetic import look_at
 from taichi_unifusion.rendering.textured_scene import load_scene, mip_levels
 from taichi_unifusion.errors import DatasetError, InputError, PoseError
-from taichi_unifusion.files.atomic import write_trajectory
+from taichi_unifusion.files.trajectories import write_trajectory
 from taichi_unifusion.types import PinholeCamera, Trajectory
 
 trimesh = pytest.importorskip("trimesh")

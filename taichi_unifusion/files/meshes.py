@@ -1,0 +1,59 @@
+"""Meshes in files: PLY, written and read; GLB and OBJ, written."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ..errors import InputError, MissingDependency
+from ..types import Mesh
+from .atomic import atomic_write, read_bytes
+from .ply import color_to_uint8, parse_ply, write_ply
+
+MESH_SUFFIXES = (".ply", ".glb", ".obj")
+
+
+def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
+    """Write `mesh` atomically; the suffix of `path` chooses PLY (binary), GLB or OBJ.
+
+    Attribute "color" becomes 8-bit RGB. PLY holds all other attributes as float properties, GLB and OBJ leave them out.
+    Raises InputError for another suffix, bad face indices or an empty GLB/OBJ, FileError where the file cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise InputError(f"{path}: a mesh is written as {', '.join(MESH_SUFFIXES)}, not as '{path.suffix}'")
+    if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise InputError(f"{path}: the faces name vertices {mesh.faces.min()}..{mesh.faces.max()}, "
+                         f"but the mesh has {len(mesh.vertices)}")
+    if suffix == ".ply":
+        with atomic_write(path) as temporary, open(temporary, "wb") as file:
+            write_ply(file, mesh)
+    else:
+        content = _encode_with_trimesh(path, mesh)
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(content)
+
+
+def read_mesh(path: str | os.PathLike) -> Mesh:
+    """Read a PLY mesh, ours or another program's; raises FileError where it is missing, truncated or inconsistent."""
+    path = Path(path)
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: meshes are read from .ply, not from '{path.suffix}'")
+    return parse_ply(read_bytes(path), name=str(path))
+
+
+def _encode_with_trimesh(path: Path, mesh: Mesh) -> bytes:
+    """The bytes of a GLB or OBJ file, vertices and faces in their order."""
+    if not len(mesh.faces):
+        raise InputError(f"{path}: the mesh is empty, which {path.suffix} cannot hold; write a .ply")
+    try:
+        import trimesh
+    except ImportError:
+        raise MissingDependency(f"{path}: writing {path.suffix} needs trimesh: pip install trimesh") from None
+    color = mesh.attributes.get("color")
+    has_normals = mesh.normals is not None
+    exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False,
+                               vertex_colors=None if color is None else color_to_uint8(color))
+    content = exported.export(file_type=path.suffix.lower()[1:], include_normals=has_normals)
+    return content.encode() if isinstance(content, str) else content
