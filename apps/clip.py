@@ -1,6 +1,8 @@
-"""Map CLIP features with the library and ask for things in plain words, as `unifusion understand` and `query` do.
+"""Map CLIP features with the library and ask for things in plain words, as `unifusion understand`
+and `query` do.
 
-    python apps/clip.py 7scenes path/to/redkitchen path/to/clip-vit-base-patch16 "sofa" "something to sit on"
+python apps/clip.py 7scenes path/to/redkitchen path/to/clip-vit-base-patch16 "sofa" "something to
+sit on"
 """
 
 import sys
@@ -13,7 +15,9 @@ from taichi_unifusion.language.questions import ask
 def main(format: str, path: str, model: str, *texts: str) -> None:
     pipeline = uf.Pipeline(uf.Config(), encoder=make_image_encoder(f"clip:{model}"))
     pipeline.run(uf.open_dataset(format, path)[::10])
-    for answer in ask(pipeline.features, pipeline.extract_mesh(), make_text_encoder(f"clip:{model}"), texts):
+    for answer in ask(
+        pipeline.features, pipeline.extract_mesh(), make_text_encoder(f"clip:{model}"), texts
+    ):
         best = f"best at {answer.regions[0].centroid.round(2)} m" if answer.found else "not here"
         print(f"{answer.text}: {len(answer.regions)} regions, {best}")
 

@@ -1,7 +1,8 @@
-"""What draws the eye, on the surface: by a simple detector, or by a salient-object network in an ONNX file.
+"""What draws the eye, on the surface: by a simple detector, or by a salient-object network in an
+ONNX file.
 
-    python apps/saliency.py 7scenes path/to/redkitchen results/saliency
-    python apps/saliency.py 7scenes path/to/redkitchen results/saliency u2net.onnx,size=320x320,activation=minmax
+python apps/saliency.py 7scenes path/to/redkitchen results/saliency python apps/saliency.py 7scenes
+path/to/redkitchen results/saliency u2net.onnx,size=320x320,activation=minmax
 """
 
 import sys
@@ -11,7 +12,9 @@ from taichi_unifusion.results.writer import write_results
 
 
 def main(format: str, path: str, out: str, network: str = "") -> None:
-    pipeline = uf.Pipeline(uf.Config(properties=(f"saliency=onnx:{network}" if network else "saliency",)))
+    pipeline = uf.Pipeline(
+        uf.Config(properties=(f"saliency=onnx:{network}" if network else "saliency",))
+    )
     run = pipeline.run(uf.open_dataset(format, path)[::10])
     results = write_results(out, pipeline, run)
     print(f"{out}: {', '.join(results.files)}")

@@ -1,7 +1,8 @@
-"""A scene as painted and as drawn, by OpenCV's filters, or in the style of an image-to-image network in an ONNX file.
+"""A scene as painted and as drawn, by OpenCV's filters, or in the style of an image-to-image
+network in an ONNX file.
 
-    python apps/style.py replica path/to/office0 results/style
-    python apps/style.py replica path/to/office0 results/style candy.onnx
+python apps/style.py replica path/to/office0 results/style
+python apps/style.py replica path/to/office0 results/style candy.onnx
 """
 
 import sys
@@ -11,8 +12,14 @@ from taichi_unifusion.results.writer import write_results
 
 
 def main(format: str, path: str, out: str, network: str = "") -> None:
-    styles = (f"style=onnx:{network},voxel_size=0.02",) if network else (
-        "style=painting,name=painting,voxel_size=0.02", "style=sketch,name=sketch,voxel_size=0.02")
+    styles = (
+        (f"style=onnx:{network},voxel_size=0.02",)
+        if network
+        else (
+            "style=painting,name=painting,voxel_size=0.02",
+            "style=sketch,name=sketch,voxel_size=0.02",
+        )
+    )
     pipeline = uf.Pipeline(uf.Config(properties=styles))
     run = pipeline.run(uf.open_dataset(format, path)[::10])
     results = write_results(out, pipeline, run)

@@ -1,10 +1,11 @@
-"""The paper's ablations (Fig. 11-13): how the surface is encoded, voxel size, eigenpairs and anchors.
+"""The paper's ablations (Fig. 11-13): how the surface is encoded, voxel size, eigenpairs and
+anchors.
 
     python benchmarks/ablation.py --out docs                        on the synthetic room: needs no data
     python benchmarks/ablation.py --only voxel-size --scene house-living --data ../shared/data --out results/ablation
 
-Prints tables and writes pictures: ablation-encoding.jpg (Fig. 11), ablation-voxel-size.jpg (Fig. 12), ablation-kernel.png
-(Fig. 13). Needs matplotlib.
+Prints tables and writes pictures: ablation-encoding.jpg (Fig. 11), ablation-voxel-size.jpg (Fig.
+12), ablation-kernel.png (Fig. 13). Needs matplotlib.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from quality_methods import PAPER
 from quality_scenes import DEPTH_RANGE, SCENES, Scene
 
 import taichi_unifusion as uf
-from taichi_unifusion.maps.encoding import EncoderSettings, PositionEncoding
 from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
+from taichi_unifusion.maps.encoding import EncoderSettings, PositionEncoding
 from taichi_unifusion.rendering.preview import View, render_mesh
 from taichi_unifusion.types import Mesh
 
 VOXEL_SIZES = (0.02, 0.03, 0.05, 0.07, 0.10)  # [m]
 EIGENPAIRS = (2, 5, 8, 12, 16, 20, 25, 30, 40, 60)
 ANCHORS = (20, 32, 64, 128, 256, 512, 1024)
-SEEDS = 5              # anchors are random: means and ranges over so many draws
-KEPT = (20, 256)       # the paper's choice of eigenpairs and anchors
-CELL = 0.0125          # [m] of marching cubes, whatever the voxel, so that voxels alone differ
+SEEDS = 5  # anchors are random: means and ranges over so many draws
+KEPT = (20, 256)  # the paper's choice of eigenpairs and anchors
+CELL = 0.0125  # [m] of marching cubes, whatever the voxel, so that voxels alone differ
 HEAD = "| variant | Accuracy % | Completeness % | F1 2.5 cm | F1 1 cm | Depth L1 cm | median cm | coverage | map MB | CPU ms |"
 
 
@@ -47,7 +48,9 @@ def reconstruct(config: uf.Config, scene: Scene) -> tuple[Mesh, float, float]:
         surface.integrate(uf.preprocess(frame, settings).transformed(frame.T_world_camera))
         uf.runtime.synchronize()
         laps.append(1e3 * (time.process_time() - start))
-    mesh = surface.extract_mesh(max(1, round(config.surface.voxel_size / CELL)), config.mesh.min_area)
+    mesh = surface.extract_mesh(
+        max(1, round(config.surface.voxel_size / CELL)), config.mesh.min_area
+    )
     return mesh, surface.memory_bytes / 2**20, float(np.median(laps[2:] or laps))
 
 
@@ -61,8 +64,10 @@ def row(name: str, mesh: Mesh, megabytes: float, milliseconds: float, scene: Sce
         surface = evaluate_surface(mesh, scene.ground_truth, views=views)
         wide, strict = surface.scores
         shares = [f"{100 * x:.1f}" for x in (wide.precision, wide.recall, wide.f1, strict.f1)]
-    return (f"| {name} | {' | '.join(shares)} | {seen.depth_l1_cm:.2f} | {seen.depth_median_cm:.2f} | {seen.coverage:.3f} | "
-            f"{megabytes:.1f} | {milliseconds:.0f} |")
+    return (
+        f"| {name} | {' | '.join(shares)} | {seen.depth_l1_cm:.2f} | {seen.depth_median_cm:.2f} | {seen.coverage:.3f} | "
+        f"{megabytes:.1f} | {milliseconds:.0f} |"
+    )
 
 
 def compare(variants: dict[str, uf.Config], scene: Scene, picture: Path, columns: int) -> None:
@@ -80,32 +85,42 @@ def shaded(mesh: Mesh, scene: Scene, title: str) -> NDArray[np.uint8]:
     """The mesh without its colour from a held-out camera, BGR."""
     frame = scene.held_out[len(scene.held_out) // 3]
     camera = frame.camera.resized(480, 480 * frame.camera.height // frame.camera.width)
-    image = render_mesh(replace(mesh, attributes={}), View(camera, frame.T_world_camera))[..., ::-1].copy()
-    return cv2.putText(image, title, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (160, 40, 0), 2, cv2.LINE_AA)
+    image = render_mesh(replace(mesh, attributes={}), View(camera, frame.T_world_camera))[
+        ..., ::-1
+    ].copy()
+    return cv2.putText(
+        image, title, (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (160, 40, 0), 2, cv2.LINE_AA
+    )
 
 
 def write_panels(path: Path, panels: Sequence[NDArray[np.uint8]], columns: int) -> None:
     """Pictures of one size, side by side in rows."""
     blank = [np.full_like(panels[0], 255)] * (-len(panels) % columns)
     cells = [*panels, *blank]
-    sheet = np.vstack([np.hstack(cells[i:i + columns]) for i in range(0, len(cells), columns)])
+    sheet = np.vstack([np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)])
     cv2.imwrite(str(path), sheet, [cv2.IMWRITE_JPEG_QUALITY, 80])
 
 
 def encoding(scene: Scene, out: Path) -> None:
-    """Fig. 11: samples beside the surface against normals as derivatives, as published and under our defaults."""
+    """Fig. 11: samples beside the surface against normals as derivatives, as published and under
+    our defaults.
+    """
     variants = {}
     for name, config in (("published", uf.load_config(PAPER)), ("ours", uf.Config())):
         for gpis in ("samples", "derivatives"):
-            variants[f"{name}: {gpis}"] = replace(config, surface=replace(config.surface, gpis=gpis))
+            variants[f"{name}: {gpis}"] = replace(
+                config, surface=replace(config.surface, gpis=gpis)
+            )
     compare(variants, scene, out / "ablation-encoding.jpg", 2)
 
 
 def voxel_size(scene: Scene, out: Path) -> None:
     """Fig. 12: the surface at several voxel sizes, under our defaults."""
     default = uf.Config()
-    variants = {f"{100 * size:g} cm": replace(default, surface=replace(default.surface, voxel_size=size))
-                for size in VOXEL_SIZES}
+    variants = {
+        f"{100 * size:g} cm": replace(default, surface=replace(default.surface, voxel_size=size))
+        for size in VOXEL_SIZES
+    }
     compare(variants, scene, out / "ablation-voxel-size.jpg", 3)
 
 
@@ -118,16 +133,41 @@ def kernel(scene: Scene | None, out: Path) -> None:
 
     figure = Figure(figsize=(8, 3), layout="constrained")
     rank, anchors = KEPT
-    studies = (("eigenpairs l", EIGENPAIRS, rank, lambda n, seed: EncoderSettings(rank=n, anchors=anchors, seed=seed)),
-               ("anchors", ANCHORS, anchors, lambda n, seed: EncoderSettings(rank=rank, anchors=n, seed=seed)))
+    studies = (
+        (
+            "eigenpairs l",
+            EIGENPAIRS,
+            rank,
+            lambda n, seed: EncoderSettings(rank=n, anchors=anchors, seed=seed),
+        ),
+        (
+            "anchors",
+            ANCHORS,
+            anchors,
+            lambda n, seed: EncoderSettings(rank=rank, anchors=n, seed=seed),
+        ),
+    )
     for axes, (what, values, kept, settings) in zip(figure.subplots(1, 2), studies, strict=True):
-        errors = np.array([[PositionEncoding(settings(n, seed)).kernel_error() for seed in range(SEEDS)] for n in values])
+        errors = np.array(
+            [
+                [PositionEncoding(settings(n, seed)).kernel_error() for seed in range(SEEDS)]
+                for n in values
+            ]
+        )
         print(f"| {what} | " + " | ".join(map(str, values)) + " |\n|---|" + "---:|" * len(values))
-        print("| mean error | " + " | ".join(f"{e:.4f}" for e in errors.mean(axis=1)) + " |\n", flush=True)
+        print(
+            "| mean error | " + " | ".join(f"{e:.4f}" for e in errors.mean(axis=1)) + " |\n",
+            flush=True,
+        )
         axes.fill_between(values, errors.min(axis=1), errors.max(axis=1), alpha=0.25)
         axes.plot(values, errors.mean(axis=1), marker="o", markersize=3)
         axes.axvline(kept, color="grey", linestyle=":", linewidth=1)
-        axes.set(xlabel=what, ylabel="mean |K - K^|", yscale="log", xscale="log" if what == "anchors" else "linear")
+        axes.set(
+            xlabel=what,
+            ylabel="mean |K - K^|",
+            yscale="log",
+            xscale="log" if what == "anchors" else "linear",
+        )
         axes.grid(alpha=0.3, which="both")
     figure.savefig(out / "ablation-kernel.png", dpi=110)
 
@@ -136,10 +176,24 @@ STUDIES = {"encoding": encoding, "voxel-size": voxel_size, "kernel": kernel}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", default=list(STUDIES), choices=list(STUDIES), metavar="STUDY",
-                        help=", ".join(STUDIES))
-    parser.add_argument("--scene", default="synthetic", choices=list(SCENES), metavar="SCENE", help=", ".join(SCENES))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        default=list(STUDIES),
+        choices=list(STUDIES),
+        metavar="STUDY",
+        help=", ".join(STUDIES),
+    )
+    parser.add_argument(
+        "--scene",
+        default="synthetic",
+        choices=list(SCENES),
+        metavar="SCENE",
+        help=", ".join(SCENES),
+    )
     parser.add_argument("--frames", type=int, help="about how many frames to fuse")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the recordings")
     parser.add_argument("--threads", type=int, help="CPU threads of Taichi (default: all)")
@@ -147,7 +201,11 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     uf.init(threads=options.threads)
-    scene = SCENES[options.scene](options.data, options.frames) if set(options.only) - {"kernel"} else None
+    scene = (
+        SCENES[options.scene](options.data, options.frames)
+        if set(options.only) - {"kernel"}
+        else None
+    )
     for name in options.only:
         print(f"\n{name} ({STUDIES[name].__doc__.partition(':')[0]})\n", flush=True)
         STUDIES[name](scene, options.out)

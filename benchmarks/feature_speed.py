@@ -1,4 +1,6 @@
-"""Seconds of a map of features: integrating a frame, and asking it at many vertices; `open_vocabulary.py speed`."""
+"""Seconds of a map of features: integrating a frame, and asking it at many vertices;
+`open_vocabulary.py speed`.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +12,24 @@ import numpy as np
 
 import taichi_unifusion as uf
 from taichi_unifusion import runtime
+from taichi_unifusion.cli.terminal import format_table
 from taichi_unifusion.language import unit_length
 from taichi_unifusion.language.embeddings import TextEmbeddings
 from taichi_unifusion.language.questions import ask
 from taichi_unifusion.maps import LatentMap
-from taichi_unifusion.cli.terminal import format_table
 from taichi_unifusion.types import Mesh
 
-FEATURES = 60, 80      # feature pixels of a frame
-NAMES = 25             # texts of the encoder that plays: as many rivals has a query
-REPEATS = 5            # of a query
+FEATURES = 60, 80  # feature pixels of a frame
+NAMES = 25  # texts of the encoder that plays: as many rivals has a query
+REPEATS = 5  # of a query
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `speed`."""
     parser.add_argument("--channels", type=int, default=512)
-    parser.add_argument("--frames", type=int, default=24, help="of 640 x 480 pixels, around the synthetic room")
+    parser.add_argument(
+        "--frames", type=int, default=24, help="of 640 x 480 pixels, around the synthetic room"
+    )
     parser.add_argument("--vertices", type=int, default=500_000)
     parser.set_defaults(run=run)
 
@@ -40,23 +44,37 @@ def run(options: argparse.Namespace) -> None:
         cloud = uf.preprocess(frame.with_features("features", values))
         clouds.append(cloud.transformed(frame.T_world_camera))
     features = LatentMap("features", options.channels)
-    steps = [seconds(lambda cloud=cloud: features.integrate(cloud)) for cloud in clouds][2:]  # the first compile
+    # the first compile
+    steps = [seconds(lambda cloud=cloud: features.integrate(cloud)) for cloud in clouds][2:]
     points = np.resize(np.concatenate([cloud.points for cloud in clouds]), (options.vertices, 3))
     names = tuple(f"text {i}" for i in range(NAMES))
-    encoder = TextEmbeddings("random", names, unit_length(rng.standard_normal((NAMES, options.channels))))
+    encoder = TextEmbeddings(
+        "random", names, unit_length(rng.standard_normal((NAMES, options.channels)))
+    )
     texts, mesh = encoder.text_features(names), Mesh(points, np.empty((0, 3), np.int32))
     asked = {
         f"one text at {options.vertices:,} vertices": lambda: features.similarity(points, texts[0]),
         "the same as a query, against one rival and what names have in common": lambda: ask(
-            features, mesh, encoder, names[:1], negatives=names[1:2]),
-        f"the same against {NAMES - 1} rivals": lambda: ask(features, mesh, encoder, names[:1], negatives=names[1:]),
+            features, mesh, encoder, names[:1], negatives=names[1:2]
+        ),
+        f"the same against {NAMES - 1} rivals": lambda: ask(
+            features, mesh, encoder, names[:1], negatives=names[1:]
+        ),
     }
-    rows = [["step", "wall s", "CPU s"],
-            [f"integrate {options.channels} channels, a frame of {len(clouds[0]):,} points", *medians(steps)]]
+    rows = [
+        ["step", "wall s", "CPU s"],
+        [
+            f"integrate {options.channels} channels, a frame of {len(clouds[0]):,} points",
+            *medians(steps),
+        ],
+    ]
     for name, work in asked.items():
         work()
         rows.append([name, *medians([seconds(work) for _ in range(REPEATS)])])
-    print(format_table(rows) + f"\n{len(features):,} voxels, {features.memory_bytes / len(features):,.0f} bytes each")
+    print(
+        format_table(rows)
+        + f"\n{len(features):,} voxels, {features.memory_bytes / len(features):,.0f} bytes each"
+    )
 
 
 def seconds(work: Callable[[], object]) -> tuple[float, float]:

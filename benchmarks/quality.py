@@ -1,12 +1,14 @@
-"""Quality of the maps against exact ground truth, held-out frames and Open3D's TSDF, all in one run.
+"""Quality of the maps against exact ground truth, held-out frames and Open3D's TSDF, all in one
+run.
 
     python benchmarks/quality.py --data ../shared/data --out results/quality
     python benchmarks/quality.py --scenes synthetic --methods ours tsdf-1cm            needs no data
     python benchmarks/quality.py --scenes kitchen --methods ours mine.yaml tsdf-1cm    ours under another configuration
 
-Prints a table; writes quality.json and, for every scene, pictures of held-out frames and of the worst regions. Surface metrics
-compare 100,000 points each way, cropped to what the cameras saw; depth and colour are those of held-out frames between the
-fused ones. Needs the extra open3d for the TSDF.
+Prints a table; writes quality.json and, for every scene, pictures of held-out frames and of the
+worst regions. Surface metrics compare 100,000 points each way, cropped to what the cameras saw;
+depth and colour are those of held-out frames between the fused ones. Needs the extra open3d for the
+TSDF.
 """
 
 from __future__ import annotations
@@ -30,24 +32,48 @@ from taichi_unifusion.evaluation.rendering import FrameScore
 from taichi_unifusion.files.atomic import check_writable
 from taichi_unifusion.types import Frame
 
-DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+DATA = Path(
+    os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
+)
 COLUMNS = {  # title -> (where in a row's numbers, format)
-    "Accuracy %": ("precision_2.5cm", ".1%"), "Completeness %": ("recall_2.5cm", ".1%"), "F1 2.5 cm": ("f1_2.5cm", ".1%"),
-    "F1 1 cm": ("f1_1cm", ".1%"), "Depth L1 cm": ("depth_l1_cm", ".2f"), "median cm": ("depth_median_cm", ".2f"),
-    "coverage": ("coverage", ".3f"), "PSNR dB": ("psnr_db", ".2f"), "SSIM": ("ssim", ".3f"), "map MB": ("map_mb", ".1f"),
+    "Accuracy %": ("precision_2.5cm", ".1%"),
+    "Completeness %": ("recall_2.5cm", ".1%"),
+    "F1 2.5 cm": ("f1_2.5cm", ".1%"),
+    "F1 1 cm": ("f1_1cm", ".1%"),
+    "Depth L1 cm": ("depth_l1_cm", ".2f"),
+    "median cm": ("depth_median_cm", ".2f"),
+    "coverage": ("coverage", ".3f"),
+    "PSNR dB": ("psnr_db", ".2f"),
+    "SSIM": ("ssim", ".3f"),
+    "map MB": ("map_mb", ".1f"),
     "of it surface": ("surface_mb", ".1f"),
-    "lean MB": ("lean_mb", ".1f"), "ms a frame": ("cpu_ms", ".0f"),
+    "lean MB": ("lean_mb", ".1f"),
+    "ms a frame": ("cpu_ms", ".0f"),
 }
 
 
-def measure(reconstruction: Reconstruction, scene: Scene) -> tuple[dict[str, float | None], tuple[FrameScore, ...]]:
+def measure(
+    reconstruction: Reconstruction, scene: Scene
+) -> tuple[dict[str, float | None], tuple[FrameScore, ...]]:
     """All numbers of one row of the table, and the scores of the held-out frames."""
     near, far = DEPTH_RANGE
-    numbers = {"map_mb": reconstruction.surface_mb + reconstruction.color_mb, "surface_mb": reconstruction.surface_mb,
-               "color_mb": reconstruction.color_mb, "lean_mb": reconstruction.lean_mb, "cpu_ms": reconstruction.cpu_ms,
-               "wall_ms": reconstruction.wall_ms, "mesh_s": reconstruction.mesh_s, "triangles": len(reconstruction.mesh.faces)}
-    rendering = evaluate_rendering(reconstruction.mesh, scene.held_out, color=reconstruction.color, depth_min=near,
-                                   depth_max=far)
+    numbers = {
+        "map_mb": reconstruction.surface_mb + reconstruction.color_mb,
+        "surface_mb": reconstruction.surface_mb,
+        "color_mb": reconstruction.color_mb,
+        "lean_mb": reconstruction.lean_mb,
+        "cpu_ms": reconstruction.cpu_ms,
+        "wall_ms": reconstruction.wall_ms,
+        "mesh_s": reconstruction.mesh_s,
+        "triangles": len(reconstruction.mesh.faces),
+    }
+    rendering = evaluate_rendering(
+        reconstruction.mesh,
+        scene.held_out,
+        color=reconstruction.color,
+        depth_min=near,
+        depth_max=far,
+    )
     numbers.update({name: value for name, value in asdict(rendering).items() if name != "frames"})
     if scene.ground_truth is not None:
         views = Views(scene.frames[0].camera, scene.T_world_camera, near, far)
@@ -55,7 +81,13 @@ def measure(reconstruction: Reconstruction, scene: Scene) -> tuple[dict[str, flo
         numbers.update({name: value for name, value in asdict(surface).items() if name != "scores"})
         for score in surface.scores:
             at = f"{100 * score.threshold:g}cm"
-            numbers.update({f"precision_{at}": score.precision, f"recall_{at}": score.recall, f"f1_{at}": score.f1})
+            numbers.update(
+                {
+                    f"precision_{at}": score.precision,
+                    f"recall_{at}": score.recall,
+                    f"f1_{at}": score.f1,
+                }
+            )
     return numbers, rendering.frames
 
 
@@ -71,21 +103,48 @@ def table(results: dict[str, dict[str, dict]]) -> str:
     for scene, methods in results.items():
         for name, row in methods.items():
             values = [row["numbers"].get(key) for key, _ in COLUMNS.values()]
-            rows.append([scene, name, *("-" if value is None else format(value, style).rstrip("%")
-                                        for value, (_, style) in zip(values, COLUMNS.values(), strict=True))])
+            rows.append(
+                [
+                    scene,
+                    name,
+                    *(
+                        "-" if value is None else format(value, style).rstrip("%")
+                        for value, (_, style) in zip(values, COLUMNS.values(), strict=True)
+                    ),
+                ]
+            )
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = ["| " + " | ".join(cell.ljust(width) if k < 2 else cell.rjust(width)
-                               for k, (cell, width) in enumerate(zip(row, widths, strict=True))) + " |" for row in rows]
-    rule = "|" + "|".join("-" * (width + 2) if k < 2 else "-" * (width + 1) + ":" for k, width in enumerate(widths)) + "|"
+    lines = [
+        "| "
+        + " | ".join(
+            cell.ljust(width) if k < 2 else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        + " |"
+        for row in rows
+    ]
+    rule = (
+        "|"
+        + "|".join(
+            "-" * (width + 2) if k < 2 else "-" * (width + 1) + ":"
+            for k, width in enumerate(widths)
+        )
+        + "|"
+    )
     return "\n".join([lines[0], rule, *lines[1:]])
 
 
 def run(options: argparse.Namespace) -> dict[str, dict[str, dict]]:
-    """Every method on every scene; what is done is written at once, so that a long run loses nothing."""
+    """Every method on every scene; what is done is written at once, so that a long run loses
+    nothing.
+    """
     results: dict[str, dict[str, dict]] = {}
     for scene_name in options.scenes:
         scene = SCENES[scene_name](options.data, options.frames)
-        print(f"{scene_name}: {len(scene.frames)} frames fused, {len(scene.held_out)} held out", flush=True)
+        print(
+            f"{scene_name}: {len(scene.frames)} frames fused, {len(scene.held_out)} held out",
+            flush=True,
+        )
         rows, pictures = results.setdefault(scene_name, {}), {}
         for name in options.methods:
             reconstruction = method(name)(scene.frames)
@@ -97,7 +156,9 @@ def run(options: argparse.Namespace) -> dict[str, dict[str, dict]]:
                 worst = compare(reconstruction, worst_frames(scene, scores))
                 write_worst(options.out / f"worst-{scene_name}-{label}.jpg", worst)
                 pictures[label] = compare(reconstruction, overview_frames(scene))
-                (options.out / "quality.json").write_text(json.dumps(results, indent=1, default=str))
+                (options.out / "quality.json").write_text(
+                    json.dumps(results, indent=1, default=str)
+                )
             del reconstruction
             gc.collect()  # maps give their memory back before the next are made
         if pictures:
@@ -106,13 +167,32 @@ def run(options: argparse.Namespace) -> dict[str, dict[str, dict]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES), metavar="SCENE",
-                        help=", ".join(SCENES))
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), metavar="METHOD",
-                        help=f"{', '.join(METHODS)}, tsdf-1cm-t8-w3 (truncation, weight) or FILE.yaml")
-    parser.add_argument("--frames", type=int, help="about how many frames to fuse (default: every 5th of the house, 30, 60)")
-    parser.add_argument("--data", type=Path, default=DATA, help=f"folder of the recordings (default: {DATA})")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scenes",
+        nargs="+",
+        default=list(SCENES),
+        choices=list(SCENES),
+        metavar="SCENE",
+        help=", ".join(SCENES),
+    )
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=list(METHODS),
+        metavar="METHOD",
+        help=f"{', '.join(METHODS)}, tsdf-1cm-t8-w3 (truncation, weight) or FILE.yaml",
+    )
+    parser.add_argument(
+        "--frames",
+        type=int,
+        help="about how many frames to fuse (default: every 5th of the house, 30, 60)",
+    )
+    parser.add_argument(
+        "--data", type=Path, default=DATA, help=f"folder of the recordings (default: {DATA})"
+    )
     parser.add_argument("--threads", type=int, help="CPU threads of Taichi (default: all)")
     parser.add_argument("--out", type=Path, help="folder for quality.json and the pictures")
     options = parser.parse_args()

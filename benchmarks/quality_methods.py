@@ -1,4 +1,6 @@
-"""Reconstructions to compare: ours under a configuration, and the TSDF of Open3D's VoxelBlockGrid with colour."""
+"""Reconstructions to compare: ours under a configuration, and the TSDF of Open3D's VoxelBlockGrid
+with colour.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,9 @@ from taichi_unifusion.types import Frame, Mesh
 
 PAPER = Path(__file__).resolve().parents[1] / "configs" / "paper.yaml"
 TRUNCATION, MIN_WEIGHT = 6.0, 1.0  # of the TSDF: in voxels, and frames that must have seen a voxel
-BLOCK = 16                         # voxels along a TSDF block (Open3D's default)
-TSDF_BYTES = {"tsdf": 4, "weight": 4, "color": 12}    # a voxel, as float32
-LEAN_BLOCK, LEAN_BYTES = 8, 4 + 2 + 6                 # the smallest that VoxelBlockGrid can be made, at some loss
+BLOCK = 16  # voxels along a TSDF block (Open3D's default)
+TSDF_BYTES = {"tsdf": 4, "weight": 4, "color": 12}  # a voxel, as float32
+LEAN_BLOCK, LEAN_BYTES = 8, 4 + 2 + 6  # the smallest that VoxelBlockGrid can be made, at some loss
 
 
 @dataclass(frozen=True)
@@ -30,14 +32,15 @@ class Reconstruction:
     """A mesh with colour, and what it took."""
 
     mesh: Mesh
-    color: Callable[[NDArray], NDArray] | None  # decodes colour at points; None: the mesh's vertex colours
-    surface_mb: float      # of the map
+    # decodes colour at points; None: the mesh's vertex colours
+    color: Callable[[NDArray], NDArray] | None
+    surface_mb: float  # of the map
     color_mb: float
-    lean_mb: float         # both, as small as the method can store them
-    cpu_ms: float          # of all threads, a frame: median
-    wall_ms: float         # a frame: median
-    mesh_s: float          # wall time of the extraction
-    settings: dict         # what was used
+    lean_mb: float  # both, as small as the method can store them
+    cpu_ms: float  # of all threads, a frame: median
+    wall_ms: float  # a frame: median
+    mesh_s: float  # wall time of the extraction
+    settings: dict  # what was used
 
 
 @dataclass
@@ -68,39 +71,81 @@ def ours(config: Config, frames: Sequence[Frame]) -> Reconstruction:
     start = time.perf_counter()
     mesh = pipeline.extract_mesh()
     mesh_s = time.perf_counter() - start
-    surface, color = pipeline.surface.memory_bytes / 2**20, pipeline.properties["color"].memory_bytes / 2**20
-    return Reconstruction(mesh, pipeline.properties["color"].query, surface, color, surface + color, *watch.median(), mesh_s,
-                          asdict(config))
+    surface, color = (
+        pipeline.surface.memory_bytes / 2**20,
+        pipeline.properties["color"].memory_bytes / 2**20,
+    )
+    return Reconstruction(
+        mesh,
+        pipeline.properties["color"].query,
+        surface,
+        color,
+        surface + color,
+        *watch.median(),
+        mesh_s,
+        asdict(config),
+    )
 
 
-def tsdf(frames: Sequence[Frame], voxel_size: float, truncation: float = TRUNCATION,
-         min_weight: float = MIN_WEIGHT) -> Reconstruction:
+def tsdf(
+    frames: Sequence[Frame],
+    voxel_size: float,
+    truncation: float = TRUNCATION,
+    min_weight: float = MIN_WEIGHT,
+) -> Reconstruction:
     """Open3D's VoxelBlockGrid on the raw depth, float32."""
     try:
         import open3d as o3d
         from open3d.core import Device, Tensor, float32
     except ImportError:
-        raise MissingDependency("the TSDF needs Open3D: pip install 'taichi-unifusion[open3d]'") from None
+        raise MissingDependency(
+            "the TSDF needs Open3D: pip install 'taichi-unifusion[open3d]'"
+        ) from None
 
     cpu, far = Device("CPU:0"), DEPTH_RANGE[1]
-    grid = o3d.t.geometry.VoxelBlockGrid(tuple(TSDF_BYTES), (float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, 8_000, cpu)
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        tuple(TSDF_BYTES), (float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, 8_000, cpu
+    )
     K, watch = Tensor(frames[0].camera.matrix), Stopwatch([])
     for frame in frames:
-        depth = o3d.t.geometry.Image(Tensor(np.where(frame.depth < DEPTH_RANGE[0], 0, frame.depth).astype(np.float32)))
+        depth = o3d.t.geometry.Image(
+            Tensor(np.where(frame.depth < DEPTH_RANGE[0], 0, frame.depth).astype(np.float32))
+        )
         color = o3d.t.geometry.Image(Tensor(frame.color.astype(np.float32) / 255))
         T_camera_world = Tensor(np.linalg.inv(frame.T_world_camera))
         with watch.lap():
-            blocks = grid.compute_unique_block_coordinates(depth, K, T_camera_world, 1.0, far, truncation)
+            blocks = grid.compute_unique_block_coordinates(
+                depth, K, T_camera_world, 1.0, far, truncation
+            )
             grid.integrate(blocks, depth, color, K, K, T_camera_world, 1.0, far, truncation)
     start = time.perf_counter()
     extracted = grid.extract_triangle_mesh(min_weight)
-    mesh = Mesh(extracted.vertex.positions.numpy(), extracted.triangle.indices.numpy().astype(np.int32),
-                attributes={"color": extracted.vertex.colors.numpy()})
+    mesh = Mesh(
+        extracted.vertex.positions.numpy(),
+        extracted.triangle.indices.numpy().astype(np.int32),
+        attributes={"color": extracted.vertex.colors.numpy()},
+    )
     mesh_s = time.perf_counter() - start
     voxels = grid.hashmap().size() * BLOCK**3
-    surface, color = voxels * (TSDF_BYTES["tsdf"] + TSDF_BYTES["weight"]) / 2**20, voxels * TSDF_BYTES["color"] / 2**20
-    return Reconstruction(mesh, None, surface, color, _lean_mb(grid), *watch.median(), mesh_s,
-                          {"voxel_size": voxel_size, "truncation_voxels": truncation, "min_weight": min_weight, "block": BLOCK})
+    surface, color = (
+        voxels * (TSDF_BYTES["tsdf"] + TSDF_BYTES["weight"]) / 2**20,
+        voxels * TSDF_BYTES["color"] / 2**20,
+    )
+    return Reconstruction(
+        mesh,
+        None,
+        surface,
+        color,
+        _lean_mb(grid),
+        *watch.median(),
+        mesh_s,
+        {
+            "voxel_size": voxel_size,
+            "truncation_voxels": truncation,
+            "min_weight": min_weight,
+            "block": BLOCK,
+        },
+    )
 
 
 def _lean_mb(grid) -> float:
@@ -127,13 +172,19 @@ METHODS: dict[str, Callable[[Sequence[Frame]], Reconstruction]] = {
 
 
 def method(name: str) -> Callable[[Sequence[Frame]], Reconstruction]:
-    """A method of METHODS, ours under the YAML file of that name, or a TSDF such as tsdf-1cm-t8-w3: truncation, weight."""
+    """A method of METHODS, ours under the YAML file of that name, or a TSDF such as tsdf-1cm-t8-w3:
+    truncation, weight.
+    """
     if name in METHODS:
         return METHODS[name]
     if match := re.fullmatch(r"tsdf-([\d.]+)cm-t([\d.]+)-w([\d.]+)", name):
         centimetres, truncation, min_weight = map(float, match.groups())
-        return partial(tsdf, voxel_size=centimetres / 100, truncation=truncation, min_weight=min_weight)
+        return partial(
+            tsdf, voxel_size=centimetres / 100, truncation=truncation, min_weight=min_weight
+        )
     if Path(name).suffix in (".yaml", ".yml"):
         return partial(ours, load_config(name))
-    raise InputError(f"method '{name}' is unknown; there are {', '.join(METHODS)}, tsdf-1cm-t8-w3 (truncation in voxels, "
-                     "weight threshold) and configurations FILE.yaml")
+    raise InputError(
+        f"method '{name}' is unknown; there are {', '.join(METHODS)}, tsdf-1cm-t8-w3 (truncation in voxels, "
+        "weight threshold) and configurations FILE.yaml"
+    )

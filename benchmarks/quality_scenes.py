@@ -1,4 +1,6 @@
-"""What quality is measured on: frames to fuse, held-out frames in between to compare with, and the true surface where known."""
+"""What quality is measured on: frames to fuse, held-out frames in between to compare with, and the
+true surface where known.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.types import Frame, Mesh
 
 DEPTH_RANGE = (0.4, 5.0)  # [m] readings that are fused, and compared with
-HELD_OUT = 16             # frames that are compared with, unless a scene says otherwise
+HELD_OUT = 16  # frames that are compared with, unless a scene says otherwise
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,9 @@ class Scene:
 
 
 def split(count: int, every: int, held_out: int = HELD_OUT) -> tuple[list[int], list[int]]:
-    """Every n-th of `count` frames, and at most so many, evenly, of those half-way between two of them."""
+    """Every n-th of `count` frames, and at most so many, evenly, of those half-way between two of
+    them.
+    """
     fused = list(range(0, count, every))
     between = [i + every // 2 for i in fused if i + every // 2 < count and every > 1]
     kept = np.linspace(0, len(between) - 1, min(held_out, len(between))).round().astype(int)
@@ -42,10 +46,19 @@ def split(count: int, every: int, held_out: int = HELD_OUT) -> tuple[list[int], 
 
 
 def synthetic(data: Path, frames: int | None) -> Scene:
-    """The synthetic room: one loop, twice as many frames as are fused, so that there are some in between."""
+    """The synthetic room: one loop, twice as many frames as are fused, so that there are some in
+    between.
+    """
     fused, between = split(2 * (frames or 60), 2)
-    noisy, exact = (SyntheticRoom(frames=2 * (frames or 60), noise=noise) for noise in (True, False))
-    return Scene("synthetic", [noisy[i] for i in fused], [exact[i] for i in between], noisy.ground_truth_mesh())
+    noisy, exact = (
+        SyntheticRoom(frames=2 * (frames or 60), noise=noise) for noise in (True, False)
+    )
+    return Scene(
+        "synthetic",
+        [noisy[i] for i in fused],
+        [exact[i] for i in between],
+        noisy.ground_truth_mesh(),
+    )
 
 
 def kitchen(data: Path, frames: int | None) -> Scene:
@@ -55,19 +68,30 @@ def kitchen(data: Path, frames: int | None) -> Scene:
 
 
 def house(path: str, data: Path, frames: int | None) -> Scene:
-    """The flat along one of its paths: every 5th frame of a hand at 30 Hz, some 20 cm apart, is fused."""
+    """The flat along one of its paths: every 5th frame of a hand at 30 Hz, some 20 cm apart, is
+    fused.
+    """
     noisy = load_house(data / "aws-small-house", path)
     exact = load_house(data / "aws-small-house", path, noise=False)
-    return _of_recording(f"house-{path}", noisy, exact, frames or -(-len(noisy) // 5), noisy.ground_truth_mesh())
+    return _of_recording(
+        f"house-{path}", noisy, exact, frames or -(-len(noisy) // 5), noisy.ground_truth_mesh()
+    )
 
 
-def _of_recording(name: str, noisy: Dataset, exact: Dataset, frames: int, ground_truth: Mesh | None,
-                  held_out: int = HELD_OUT) -> Scene:
+def _of_recording(
+    name: str,
+    noisy: Dataset,
+    exact: Dataset,
+    frames: int,
+    ground_truth: Mesh | None,
+    held_out: int = HELD_OUT,
+) -> Scene:
     fused, between = split(len(noisy), max(2, len(noisy) // frames), held_out)
     return Scene(name, [noisy[i] for i in fused], [exact[i] for i in between], ground_truth)
 
 
-SCENES: dict[str, Callable[[Path, int | None], Scene]] = {  # name -> what makes it of the data folder and a number of frames
+# name -> what makes it of the data folder and a number of frames
+SCENES: dict[str, Callable[[Path, int | None], Scene]] = {
     "synthetic": synthetic,
     "kitchen": kitchen,
     "house-living": partial(house, "living"),

@@ -1,4 +1,5 @@
-"""Quality against the input frames, and what it took: depth and colour of the map, rendered at the frames' own poses.
+"""Quality against the input frames, and what it took: depth and colour of the map, rendered at the
+frames' own poses.
 
     python benchmarks/rendering.py 7scenes PATH --end 200 --every 10
     python benchmarks/rendering.py replica PATH --depth-max 10
@@ -22,7 +23,9 @@ from taichi_unifusion.evaluation import evaluate_rendering
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("format")
     parser.add_argument("path", nargs="?")
     parser.add_argument("--end", type=int)
@@ -34,7 +37,7 @@ def main() -> None:
     live = uf.init()
     config = uf.load_config(options.config) if options.config else uf.Config()
     settings = dataclasses.replace(config.preprocess, depth_max=options.depth_max)
-    frames = list(uf.open_dataset(options.format, options.path)[:options.end:options.every])
+    frames = list(uf.open_dataset(options.format, options.path)[: options.end : options.every])
     surface, color = uf.SurfaceMap(config.surface), uf.PropertyMap("color", 3, config.color)
 
     def integrate(frame: uf.Frame) -> float:
@@ -51,12 +54,18 @@ def main() -> None:
     mesh = mesh.with_attribute("color", color.query(mesh.vertices))
     to_mesh = time.perf_counter() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    result = evaluate_rendering(mesh, frames, color=color.query, depth_min=settings.depth_min, depth_max=settings.depth_max)
-    print(f"depth L1 {result.depth_l1_cm:.3f} cm, median {result.depth_median_cm:.3f} cm, coverage {result.coverage:.3f}, "
-          f"PSNR {result.psnr_db:.3f} dB, SSIM {result.ssim:.3f}")
-    print(f"{len(frames)} frames on {live.description}: median {np.median(laps[1:]):.0f} ms a frame, first {laps[0]:.0f} ms, "
-          f"mesh in {to_mesh:.2f} s ({len(mesh.faces):,} triangles), {surface.memory_bytes / 2**20:.1f} + "
-          f"{color.memory_bytes / 2**20:.1f} MB of maps, peak memory {peak:.2f} GB")
+    result = evaluate_rendering(
+        mesh, frames, color=color.query, depth_min=settings.depth_min, depth_max=settings.depth_max
+    )
+    print(
+        f"depth L1 {result.depth_l1_cm:.3f} cm, median {result.depth_median_cm:.3f} cm, coverage {result.coverage:.3f}, "
+        f"PSNR {result.psnr_db:.3f} dB, SSIM {result.ssim:.3f}"
+    )
+    print(
+        f"{len(frames)} frames on {live.description}: median {np.median(laps[1:]):.0f} ms a frame, first {laps[0]:.0f} ms, "
+        f"mesh in {to_mesh:.2f} s ({len(mesh.faces):,} triangles), {surface.memory_bytes / 2**20:.1f} + "
+        f"{color.memory_bytes / 2**20:.1f} MB of maps, peak memory {peak:.2f} GB"
+    )
 
 
 if __name__ == "__main__":

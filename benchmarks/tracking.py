@@ -1,4 +1,5 @@
-"""Tracking: trajectory error and time from RGB-D frames alone, and how well a pair of frames is refined, against peers.
+"""Tracking: trajectory error and time from RGB-D frames alone, and how well a pair of frames is
+refined, against peers.
 
     python benchmarks/tracking.py 7scenes PATH --end 300
     python benchmarks/tracking.py 7scenes PATH --end 300 --methods ours ours-no-loops ours-geometry
@@ -7,11 +8,13 @@
     python benchmarks/tracking.py tum PATH/rgbd_dataset_freiburg1_desk
     python benchmarks/tracking.py 7scenes PATH --end 300 --refine 100      # a pair of frames, disturbed so many times
 
-ATE is the RMSE of camera positions after the best rigid motion, RPE that of the motion from frame to frame, both against the
-recording's poses; "end" is how far the last camera is off, seen from the first. "agree" needs no truth: the share of what
-frames ten apart see in common that lies within 4 cm at these poses, with normals within 25 degrees. Times are process CPU time of
-all threads, after a warm-up, reading of frames left out; "mean" holds keyframes, loops and the final optimisation. The methods
-take the frames turn by turn. Open3D and OpenCV get the same frames and intrinsics, and their own defaults.
+ATE is the RMSE of camera positions after the best rigid motion, RPE that of the motion from frame
+to frame, both against the recording's poses; "end" is how far the last camera is off, seen from the
+first. "agree" needs no truth: the share of what frames ten apart see in common that lies within 4
+cm at these poses, with normals within 25 degrees. Times are process CPU time of all threads, after
+a warm-up, reading of frames left out; "mean" holds keyframes, loops and the final optimisation. The
+methods take the frames turn by turn. Open3D and OpenCV get the same frames and intrinsics, and
+their own defaults.
 """
 
 from __future__ import annotations
@@ -26,21 +29,21 @@ import numpy as np
 import tracking_peers as peers
 
 import taichi_unifusion as uf
-from taichi_unifusion.evaluation.trajectory import evaluate_trajectory
 from taichi_unifusion.cli.terminal import format_table
-from taichi_unifusion.tracking import TrackingSettings
+from taichi_unifusion.evaluation.trajectory import evaluate_trajectory
 from taichi_unifusion.geometry import se3
+from taichi_unifusion.tracking import TrackingSettings
 from taichi_unifusion.tracking.pyramid import SurfelPyramid, build_pyramid, reduce_frame
 from taichi_unifusion.tracking.registration import evaluate, register
 from taichi_unifusion.tracking.rgbd import RgbdTracker
 from taichi_unifusion.types import Trajectory
 
 DEPTH_RANGE = 0.1, 6.0
-PAIRED = 10                          # frames apart that are compared by "agree"
-COMMON = 0.25                        # share of a frame that must be seen by both
+PAIRED = 10  # frames apart that are compared by "agree"
+COMMON = 0.25  # share of a frame that must be seen by both
 DISTURBANCE = 0.03, np.radians(2.0)  # [m, rad] at most
-BACK = 0.003, np.radians(0.2)        # what counts as found back
-WARM_UP = 3                          # frames
+BACK = 0.003, np.radians(0.2)  # what counts as found back
+WARM_UP = 3  # frames
 HEADER = ["method", "tracked", "ATE cm", "end cm", "RPE cm", "agree %", "median ms", "mean ms"]
 
 
@@ -54,8 +57,11 @@ class Ours:
         self.tracker.track(frame)
 
     def finish(self) -> dict[int, np.ndarray]:
-        return {tracked.index: tracked.T_world_camera for tracked in self.tracker.finish().frames
-                if tracked.T_world_camera is not None}
+        return {
+            tracked.index: tracked.T_world_camera
+            for tracked in self.tracker.finish().frames
+            if tracked.T_world_camera is not None
+        }
 
 
 METHODS: dict[str, Callable[[uf.PinholeCamera], object]] = {
@@ -70,9 +76,14 @@ METHODS: dict[str, Callable[[uf.PinholeCamera], object]] = {
 
 
 def agreement(pyramids: dict, poses: dict[int, np.ndarray]) -> str:
-    """Share of what two frames see in common that lies within 4 cm, frames a few apart: says of poses how well depths agree."""
+    """Share of what two frames see in common that lies within 4 cm, frames a few apart: says of
+    poses how well depths agree.
+    """
     kept = [index for index in pyramids if poses.get(index) is not None]
-    found = [evaluate(pyramids[b], pyramids[a], se3.inverse(poses[a]) @ poses[b]) for a, b in pairwise(kept)]
+    found = [
+        evaluate(pyramids[b], pyramids[a], se3.inverse(poses[a]) @ poses[b])
+        for a, b in pairwise(kept)
+    ]
     shares = [pair.agreement for pair in found if pair.overlap > COMMON]
     return f"{100 * np.mean(shares):.1f}" if shares else "-"
 
@@ -97,15 +108,27 @@ class Run:
         found = [index for index in poses if truth[index] is not None]
         if len(found) < 3:
             return [*counted, *["-"] * 4, *times]
-        estimate, given = (np.array([source[index] for index in found]) for source in (poses, truth))
-        result = evaluate_trajectory(*(Trajectory(np.array(found, float), T) for T in (estimate, given)))
+        estimate, given = (
+            np.array([source[index] for index in found]) for source in (poses, truth)
+        )
+        result = evaluate_trajectory(
+            *(Trajectory(np.array(found, float), T) for T in (estimate, given))
+        )
         last, _ = se3.distance(*(se3.inverse(T[0]) @ T[-1] for T in (estimate, given)))
-        return [*counted, f"{result.ate_cm.rmse:.2f}", f"{100 * last:.2f}", f"{result.rpe_translation_cm.rmse:.2f}",
-                agreement(pyramids, poses), *times]
+        return [
+            *counted,
+            f"{result.ate_cm.rmse:.2f}",
+            f"{100 * last:.2f}",
+            f"{result.rpe_translation_cm.rmse:.2f}",
+            agreement(pyramids, poses),
+            *times,
+        ]
 
 
 def compare(names: Sequence[str], frames: uf.datasets.Dataset) -> list[list[str]]:
-    """Rows of all methods and of the given poses; they take the frames turn by turn, so that their times compare."""
+    """Rows of all methods and of the given poses; they take the frames turn by turn, so that their
+    times compare.
+    """
     warm_up(names, frames[:WARM_UP])
     runs, truth, pyramids = [Run(name, frames[0].camera) for name in names], {}, {}
     for i, frame in enumerate(frames):
@@ -114,7 +137,14 @@ def compare(names: Sequence[str], frames: uf.datasets.Dataset) -> list[list[str]
             pyramids[frame.index] = pyramid(frame)
         for run in runs:
             run.track(frame)
-    given = ["given poses", f"{len(truth)} of {len(truth)}", *["-"] * 3, agreement(pyramids, truth), "-", "-"]
+    given = [
+        "given poses",
+        f"{len(truth)} of {len(truth)}",
+        *["-"] * 3,
+        agreement(pyramids, truth),
+        "-",
+        "-",
+    ]
     return [*(run.row(truth, pyramids) for run in runs), given]
 
 
@@ -140,7 +170,9 @@ def disturbance(rng: np.random.Generator) -> np.ndarray:
 
 
 def refine(frames: uf.datasets.Dataset, trials: int, apart: int) -> str:
-    """Pairs of frames from known disturbances: how often, how near and how fast they come back to where they came from."""
+    """Pairs of frames from known disturbances: how often, how near and how fast they come back to
+    where they came from.
+    """
     rng = np.random.default_rng(0)
     errors, times, pyramid_times, their_times = [], [], [], []
     for trial, start in enumerate(rng.integers(0, len(frames) - apart, trials)):
@@ -148,25 +180,43 @@ def refine(frames: uf.datasets.Dataset, trials: int, apart: int) -> str:
         began = time.process_time()
         first, second = pyramid(a), pyramid(b)
         pyramid_times.append(time.process_time() - began)
-        optimum = register(second, first, se3.inverse(a.T_world_camera) @ b.T_world_camera).T_target_source
+        optimum = register(
+            second, first, se3.inverse(a.T_world_camera) @ b.T_world_camera
+        ).T_target_source
         guess = disturbance(rng) @ optimum
         began = time.process_time()
         found = register(second, first, guess).T_target_source
         times.append(time.process_time() - began)
         errors.append(se3.distance(found, optimum))
-        if trial % 10 == 1:  # a few are enough for the ratio of times: turn by turn, in the same run
+        # a few are enough for the ratio of times: turn by turn, in the same run
+        if trial % 10 == 1:
             began = time.process_time()
             with suppress(RuntimeError):  # it raises where it finds no correspondence
                 peers.colored_icp(a, b, guess)
             their_times.append(time.process_time() - began)
-    errors, (ours, pyramids, theirs) = np.array(errors), (1e3 * np.median(t) for t in (times, pyramid_times, their_times))
+    errors, (ours, pyramids, theirs) = (
+        np.array(errors),
+        (1e3 * np.median(t) for t in (times, pyramid_times, their_times)),
+    )
     back = int((errors < BACK).all(axis=1).sum())
-    shown = [f"{1e3 * distance:.2f} mm, {np.degrees(angle):.3f} degrees"
-             for distance, angle in (np.median(errors, axis=0), errors.max(axis=0))]
-    return format_table([["what", "value"], ["found back", f"{back} of {trials}"], ["median error", shown[0]],
-                         ["largest error", shown[1]], ["alignment", f"{ours:.0f} ms"],
-                         ["with both pyramids", f"{ours + pyramids:.0f} ms"],
-                         ["Open3D colored ICP, 3 scales", f"{theirs:.0f} ms, {theirs / (ours + pyramids):.1f} times as long"]])
+    shown = [
+        f"{1e3 * distance:.2f} mm, {np.degrees(angle):.3f} degrees"
+        for distance, angle in (np.median(errors, axis=0), errors.max(axis=0))
+    ]
+    return format_table(
+        [
+            ["what", "value"],
+            ["found back", f"{back} of {trials}"],
+            ["median error", shown[0]],
+            ["largest error", shown[1]],
+            ["alignment", f"{ours:.0f} ms"],
+            ["with both pyramids", f"{ours + pyramids:.0f} ms"],
+            [
+                "Open3D colored ICP, 3 scales",
+                f"{theirs:.0f} ms, {theirs / (ours + pyramids):.1f} times as long",
+            ],
+        ]
+    )
 
 
 def open_frames(format: str, path: str | None) -> uf.datasets.Dataset:
@@ -179,18 +229,22 @@ def open_frames(format: str, path: str | None) -> uf.datasets.Dataset:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("format")
     parser.add_argument("path", nargs="?")
     parser.add_argument("--end", type=int)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--refine", type=int, metavar="TRIALS")
-    parser.add_argument("--apart", type=int, default=10, help="frames between the two of a pair (default: 10)")
+    parser.add_argument(
+        "--apart", type=int, default=10, help="frames between the two of a pair (default: 10)"
+    )
     parser.add_argument("--threads", type=int)
     options = parser.parse_args()
     uf.init("cpu", threads=options.threads)
-    frames = open_frames(options.format, options.path)[:options.end:options.every]
+    frames = open_frames(options.format, options.path)[: options.end : options.every]
     if options.refine:
         print(refine(frames, options.refine, options.apart))
         return

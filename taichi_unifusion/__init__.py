@@ -1,4 +1,5 @@
-"""Uni-Fusion: RGB-D frames to Latent Implicit Maps of surface, colour and any property, with Taichi on CUDA and CPU.
+"""Uni-Fusion: RGB-D frames to Latent Implicit Maps of surface, colour and any property, with Taichi
+on CUDA and CPU.
 
 Names load when they are first used, so that `import taichi_unifusion` is quick and starts nothing.
 """
@@ -10,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import lazy_loader
 
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # read by Taichi's first import, wherever that happens
+# read by Taichi's first import, wherever that happens
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
 if TYPE_CHECKING:
     from .config import Config, load_config
@@ -24,8 +26,24 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = ["Config", "Frame", "Mesh", "PinholeCamera", "Pipeline", "PointCloud", "PropertyMap", "SurfaceMap", "Trajectory",
-           "UniFusionError", "__version__", "init", "load_config", "load_map", "open_dataset", "preprocess"]
+__all__ = [
+    "Config",
+    "Frame",
+    "Mesh",
+    "PinholeCamera",
+    "Pipeline",
+    "PointCloud",
+    "PropertyMap",
+    "SurfaceMap",
+    "Trajectory",
+    "UniFusionError",
+    "__version__",
+    "init",
+    "load_config",
+    "load_map",
+    "open_dataset",
+    "preprocess",
+]
 
 
 _load, __dir__, _ = lazy_loader.attach(

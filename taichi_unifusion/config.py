@@ -1,6 +1,8 @@
-"""Config: one frozen dataclass that is schema, defaults and `--help` text, with a strict YAML overlay.
+"""Config: one frozen dataclass that is schema, defaults and `--help` text, with a strict YAML
+overlay.
 
-Defaults < `--config FILE` < flags. A file holds the differences from the defaults; a run saves all that it used.
+Defaults < `--config FILE` < flags. A file holds the differences from the defaults; a run saves all
+that it used.
 """
 
 from __future__ import annotations
@@ -31,15 +33,20 @@ class MeshSettings:
     """The mesh that is extracted at the end."""
 
     resolution: int = 4
-    """Marching-cubes cells along the edge of a surface voxel; 8 gives 4 times the triangles of 4."""
+    """Marching-cubes cells along the edge of a surface voxel; 8 gives 4 times the triangles of 4.
+    """
     formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply", "glb")
     """Files to write the mesh to."""
     min_area: float = 0.001
-    """Connected parts of less than this area, in square metres, are left out: mostly stray readings. 0 keeps all."""
+    """Connected parts of less than this area, in square metres, are left out: mostly stray
+    readings. 0 keeps all.
+    """
 
     def __post_init__(self) -> None:
         if not 1 <= self.resolution <= MAX_RESOLUTION:
-            raise InputError(f"resolution: must lie in 1..{MAX_RESOLUTION} cells a voxel, got {self.resolution}")
+            raise InputError(
+                f"resolution: must lie in 1..{MAX_RESOLUTION} cells a voxel, got {self.resolution}"
+            )
 
 
 @dataclass(frozen=True)
@@ -59,7 +66,9 @@ class Config:
     color: PropertySettings = field(default_factory=PropertySettings)
     """The map of its colour."""
     properties: tuple[str, ...] = ()
-    """What else to map, as NAME[=METHOD[:FILE]][,option=value...], for example saliency or style=sketch."""
+    """What else to map, as NAME[=METHOD[:FILE]][,option=value...], for example saliency or
+    style=sketch.
+    """
     property_map: PropertySettings = field(default_factory=lambda: PropertySettings(voxel_size=0.1))
     """The maps of these; a property may say otherwise, as in saliency,voxel_size=0.05."""
     feature_map: LatentSettings = field(default_factory=LatentSettings)
@@ -75,8 +84,8 @@ class Config:
 def load_config(path: str | Path, base: Config | None = None) -> Config:
     """`base` (the defaults) with what the YAML file says instead.
 
-    Raises FileError where the file cannot be read, ConfigError, with the key's path, for an unknown key or a value of the wrong
-    type or range.
+    Raises FileError where the file cannot be read, ConfigError, with the key's path, for an unknown
+    key or a value of the wrong type or range.
     """
     try:
         values = yaml.load(read_bytes(path), Loader=_StrictLoader)
@@ -85,7 +94,10 @@ def load_config(path: str | Path, base: Config | None = None) -> Config:
         where = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "unreadable characters"
         raise ConfigError(f"{path}{where}: not valid YAML ({problem})") from None
-    except (RecursionError, ValueError) as error:  # nested too deep; a date or number that does not exist
+    except (
+        RecursionError,
+        ValueError,
+    ) as error:  # nested too deep; a date or number that does not exist
         raise ConfigError(f"{path}: not valid YAML ({error})") from None
     return _overlay(base or Config(), values, str(path), "")
 
@@ -103,26 +115,37 @@ class _StrictLoader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = str(key_node.value)
             if key in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"key '{key}' is given twice", key_node.start_mark)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key '{key}' is given twice", key_node.start_mark
+                )
             seen.add(key)
         return super().construct_mapping(node, deep)
 
 
 def _overlay(base: Any, values: Any, source: str, at: str) -> Any:
-    """The dataclass `base` with the mapping `values` over it; None, an empty section, changes nothing."""
+    """The dataclass `base` with the mapping `values` over it; None, an empty section, changes
+    nothing.
+    """
     if values is None:
         return base
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{source}: {at or 'the file'}: expected keys and values, got {reprlib.repr(values)}")
+        raise ConfigError(
+            f"{source}: {at or 'the file'}: expected keys and values, got {reprlib.repr(values)}"
+        )
     types, changes = get_type_hints(type(base)), {}
     for key, value in values.items():
         here = f"{at}.{key}" if at else str(key)
         if key not in types:
-            raise ConfigError(f"{source}: unknown key '{here[:80]}'{_suggest(str(key), types)}; keys{' there' if at else ''}: "
-                              f"{', '.join(types)}")
+            raise ConfigError(
+                f"{source}: unknown key '{here[:80]}'{_suggest(str(key), types)}; keys{' there' if at else ''}: "
+                f"{', '.join(types)}"
+            )
         current = getattr(base, key)
-        changes[key] = (_overlay(current, value, source, here) if is_dataclass(current)
-                        else _convert(value, types[key], f"{source}: {here}"))
+        changes[key] = (
+            _overlay(current, value, source, here)
+            if is_dataclass(current)
+            else _convert(value, types[key], f"{source}: {here}")
+        )
     try:
         return replace(base, **changes)
     except InputError as error:
@@ -141,12 +164,15 @@ def _convert(value: Any, wanted: Any, at: str) -> Any:
     if origin is Literal:
         if value in options:
             return value
-        raise ConfigError(f"{at}: {reprlib.repr(value)} is unknown{_suggest(str(value)[:80], options)}; "
-                          f"choose one of {', '.join(options)}")
+        raise ConfigError(
+            f"{at}: {reprlib.repr(value)} is unknown{_suggest(str(value)[:80], options)}; "
+            f"choose one of {', '.join(options)}"
+        )
     if wanted is float and isinstance(value, str):  # YAML 1.1 takes 1e-3, without a point, for text
         with suppress(ValueError):
             value = float(value)
-    if wanted is float and type(value) in (int, float) and abs(value) <= sys.float_info.max:  # no NaN, no infinity
+    # no NaN, no infinity
+    if wanted is float and type(value) in (int, float) and abs(value) <= sys.float_info.max:
         return float(value)
     if type(value) is wanted and wanted is not float:
         return value

@@ -1,6 +1,7 @@
 """What can go wrong, as types: one root, each child also the built-in that callers expect.
 
-A message says what, where and what to do, in one sentence. The command line catches `UniFusionError` once and exits 2.
+A message says what, where and what to do, in one sentence. The command line catches
+`UniFusionError` once and exits 2.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ class ConfigError(InputError):
 
 
 class DatasetError(UniFusionError, ValueError):
-    """A data set as a whole cannot be used: unknown format, empty folder, no intrinsics, unreadable trajectory."""
+    """A data set as a whole cannot be used: unknown format, empty folder, no intrinsics, unreadable
+    trajectory.
+    """
 
 
 class FrameError(DatasetError):

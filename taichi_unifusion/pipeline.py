@@ -1,4 +1,6 @@
-"""Pipeline: posed frames -> surface LIM, colour LIM, a LIM for every other property, features among them -> mesh (Fig. 7)."""
+"""Pipeline: posed frames -> surface LIM, colour LIM, a LIM for every other property, features among
+them -> mesh (Fig. 7).
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ import numpy as np
 
 from . import runtime
 from .config import Config
+from .datasets.loading import load_ahead
 from .errors import FrameError, InputError, PoseError, UniFusionError
 from .language import ImageEncoder, feature_image
-from .datasets.loading import load_ahead
 from .maps import BaseMap, LatentMap, PropertyMap, SurfaceMap
 from .maps.property_group import group_maps
 from .preprocessing import PreprocessSettings, preprocess
@@ -25,7 +27,8 @@ FEATURES = "features"  # name of the map of image-text features
 
 
 class Pipeline:
-    """Fuses frames into a surface map, a colour map, and a map for every property that the configuration or the caller names.
+    """Fuses frames into a surface map, a colour map, and a map for every property that the
+    configuration or the caller names.
 
     With an image encoder also into a map of its features, named FEATURES.
 
@@ -34,29 +37,45 @@ class Pipeline:
         pipeline.extract_mesh().save("kitchen.ply")
     """
 
-    def __init__(self, config: Config | None = None, properties: Iterable[SurfaceProperty] = (),
-                 encoder: ImageEncoder | None = None) -> None:
+    def __init__(
+        self,
+        config: Config | None = None,
+        properties: Iterable[SurfaceProperty] = (),
+        encoder: ImageEncoder | None = None,
+    ) -> None:
         self.config, self.encoder = config or Config(), encoder
         made = (make_property(text, self.config.property_map) for text in self.config.properties)
         self.sources = _by_name((*made, *properties))
         runtime.init(self.config.device, threads=self.config.threads or None)
         self.surface = SurfaceMap(self.config.surface)
-        self.properties = {"color": PropertyMap("color", 3, self.config.color),
-                           **{name: PropertyMap(name, source.channels, source.settings or self.config.property_map)
-                              for name, source in self.sources.items()}}
+        self.properties = {
+            "color": PropertyMap("color", 3, self.config.color),
+            **{
+                name: PropertyMap(
+                    name, source.channels, source.settings or self.config.property_map
+                )
+                for name, source in self.sources.items()
+            },
+        }
         self.groups = group_maps(self.properties.values())
-        self.features: LatentMap | None = None  # until the first features say how many channels they have
+        # until the first features say how many channels they have
+        self.features: LatentMap | None = None
 
     @property
     def maps(self) -> dict[str, BaseMap]:
         """All maps by name, the surface first."""
-        return {"surface": self.surface, **self.properties, **({} if self.features is None else {FEATURES: self.features})}
+        return {
+            "surface": self.surface,
+            **self.properties,
+            **({} if self.features is None else {FEATURES: self.features}),
+        }
 
     def step(self, frame: Frame) -> StepResult:
-        """Fuse one frame; a property that the frame lacks, or does not allow to be made, is left out.
+        """Fuse one frame; a property that the frame lacks, or does not allow to be made, is left
+        out.
 
-        Raises FrameError where the frame has no pose or no usable depth, OutOfRange where it lies beyond a map's index range,
-        CapacityError where a map would grow beyond safe memory.
+        Raises FrameError where the frame has no pose or no usable depth, OutOfRange where it lies
+        beyond a map's index range, CapacityError where a map would grow beyond safe memory.
         """
         clock = StageClock()
         if frame.T_world_camera is None:
@@ -77,10 +96,14 @@ class Pipeline:
         if FEATURES in cloud.features:
             with clock.stage(FEATURES):
                 integrations[FEATURES] = self.features.integrate(cloud)
-        return StepResult(frame.index, frame.name, len(cloud), integrations, clock.milliseconds, lacking)
+        return StepResult(
+            frame.index, frame.name, len(cloud), integrations, clock.milliseconds, lacking
+        )
 
     def _with_properties(self, frame: Frame, clock: StageClock) -> tuple[Frame, dict[str, str]]:
-        """The frame with an image of every property (f_im, Fig. 6), and by name why one cannot be had."""
+        """The frame with an image of every property (f_im, Fig. 6), and by name why one cannot be
+        had.
+        """
         lacking = {}
         for name, source in self.sources.items():
             try:
@@ -95,17 +118,27 @@ class Pipeline:
                     frame = frame.with_features(FEATURES, feature_image(self.encoder, frame))
                 channels = frame.features[FEATURES].values.shape[2]
                 if self.features is None:
-                    self.features = LatentMap(FEATURES, channels, self.config.feature_map, source=self.encoder.name)
+                    self.features = LatentMap(
+                        FEATURES, channels, self.config.feature_map, source=self.encoder.name
+                    )
             except FrameError as error:
                 lacking[FEATURES] = str(error)
         return frame, lacking
 
-    def run(self, sequence: Sequence[Frame], *, strict: bool = False, stop: Callable[[], bool] = lambda: False,
-            on_frame: Callable[[int, int], None] = lambda done, total: None) -> RunResult:
-        """Fuse a sequence in order, skipping frames that cannot be used; `strict` ends the run at the first of them.
+    def run(
+        self,
+        sequence: Sequence[Frame],
+        *,
+        strict: bool = False,
+        stop: Callable[[], bool] = lambda: False,
+        on_frame: Callable[[int, int], None] = lambda done, total: None,
+    ) -> RunResult:
+        """Fuse a sequence in order, skipping frames that cannot be used; `strict` ends the run at
+        the first of them.
 
-        `stop` is asked before every frame, `on_frame` told after it. What ends a run early is in the result, with all that was
-        done until then; raises DatasetError only where not one frame could be used.
+        `stop` is asked before every frame, `on_frame` told after it. What ends a run early is in
+        the result, with all that was done until then; raises DatasetError only where not one frame
+        could be used.
         """
         log, failure, interrupted = RunLog(sequence), None, False
         for i, load in enumerate(load_ahead(sequence)):
@@ -128,21 +161,35 @@ class Pipeline:
         return log.result(interrupted, failure)
 
     def extract_mesh(self, resolution: int | None = None) -> Mesh:
-        """The mesh of all that was fused so far, coloured; `resolution` overrides the configuration's."""
+        """The mesh of all that was fused so far, coloured; `resolution` overrides the
+        configuration's.
+        """
         mesh = self.config.mesh
-        return extract_mesh(self.surface, self.properties, mesh.resolution if resolution is None else resolution, mesh.min_area)
+        return extract_mesh(
+            self.surface,
+            self.properties,
+            mesh.resolution if resolution is None else resolution,
+            mesh.min_area,
+        )
 
 
 def _by_name(properties: Iterable[SurfaceProperty]) -> dict[str, SurfaceProperty]:
     named: dict[str, SurfaceProperty] = {}
     for made in properties:
         if named.setdefault(made.name, made) is not made:
-            raise InputError(f"property '{made.name}' is asked for twice; give one of them another name, as in "
-                             f"{made.name},name=other")
+            raise InputError(
+                f"property '{made.name}' is asked for twice; give one of them another name, as in "
+                f"{made.name},name=other"
+            )
     return named
 
 
-def extract_mesh(surface: SurfaceMap, properties: Mapping[str, PropertyMap], resolution: int, min_area: float = 0.0) -> Mesh:
+def extract_mesh(
+    surface: SurfaceMap,
+    properties: Mapping[str, PropertyMap],
+    resolution: int,
+    min_area: float = 0.0,
+) -> Mesh:
     """The surface as a mesh that carries every property that has data."""
     mesh = surface.extract_mesh(resolution, min_area)
     for name, source in properties.items():
@@ -170,6 +217,8 @@ def _why_empty(frame: Frame, settings: PreprocessSettings) -> str:
     if not len(readings):
         return "the depth image holds no reading at all"
     if not ((readings >= settings.depth_min) & (readings <= settings.depth_max)).any():
-        return (f"all depth readings lie outside {settings.depth_min:g}..{settings.depth_max:g} m "
-                f"(median {np.median(readings):.3g} m); is the depth scale wrong? Else see preprocess.depth_min and depth_max")
+        return (
+            f"all depth readings lie outside {settings.depth_min:g}..{settings.depth_max:g} m "
+            f"(median {np.median(readings):.3g} m); is the depth scale wrong? Else see preprocess.depth_min and depth_max"
+        )
     return f"all {len(readings)} depth readings lie on edges, on grazing surfaces or too far apart"

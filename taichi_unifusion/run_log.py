@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .datasets.checks import guess_depth_scale
+from .datasets.loading import index_in_recording, recording_of
 from .datasets.pose_convention import guess_pose_convention, has_moved
 from .errors import DatasetError, FrameError, OutOfRange, PoseError, SizeMismatch, UniFusionError
-from .datasets.loading import index_in_recording, recording_of
 from .maps import Integration
 from .types import Frame, Trajectory
 
@@ -39,20 +39,21 @@ SKIP_REASONS: dict[type[UniFusionError], str] = {  # the first class that fits n
 class StepResult:
     """What one frame did."""
 
-    index: int                                # place in its recording
+    index: int  # place in its recording
     name: str
-    points: int                               # after preprocessing
-    integrations: Mapping[str, Integration]   # by map
-    milliseconds: Mapping[str, float]         # by stage
-    lacking: Mapping[str, str] = field(default_factory=dict)  # property -> why the frame does not give it
+    points: int  # after preprocessing
+    integrations: Mapping[str, Integration]  # by map
+    milliseconds: Mapping[str, float]  # by stage
+    # property -> why the frame does not give it
+    lacking: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class SkippedFrame:
     """A frame that was not used, and why."""
 
-    index: int    # place in its recording
-    reason: str   # its kind, one of SKIP_REASONS
+    index: int  # place in its recording
+    reason: str  # its kind, one of SKIP_REASONS
     message: str
 
 
@@ -62,10 +63,10 @@ class RunResult:
 
     steps: tuple[StepResult, ...]
     skipped: tuple[SkippedFrame, ...]
-    trajectory: Trajectory                 # of the frames used
+    trajectory: Trajectory  # of the frames used
     warnings: tuple[str, ...]
     seconds: float
-    interrupted: bool = False              # asked to stop before the last frame
+    interrupted: bool = False  # asked to stop before the last frame
     failure: UniFusionError | None = None  # what else ended the run before the last frame
 
 
@@ -82,7 +83,7 @@ class RunLog:
         self.warnings: list[str] = []
         self.scale_checked = self.color_missing = False
         self.reference: Frame | None = None  # with which poses are checked
-        self.pose_pairs = POSE_PAIRS         # left to check them with
+        self.pose_pairs = POSE_PAIRS  # left to check them with
         for sentence in getattr(sequence, "warnings", ()):
             self.warn(sentence)
 
@@ -115,7 +116,9 @@ class RunLog:
     def add_step(self, frame: Frame, step: StepResult, waited: float) -> None:
         if frame.color is None and not self.color_missing:
             self.color_missing = True
-            self.warn(f"{name_of(frame)}: there is no colour image; frames without one add to the surface only")
+            self.warn(
+                f"{name_of(frame)}: there is no colour image; frames without one add to the surface only"
+            )
         for name, reason in step.lacking.items():
             if not any(name in earlier.lacking for earlier in self.steps):
                 self.warn(f"{reason}; frames without it add to the other maps only")
@@ -134,11 +137,21 @@ class RunLog:
         if not self.steps and not interrupted:
             raise failure or DatasetError(self._nothing_used())
         stamps = [stamp for stamp, _ in self.poses]
-        if None in stamps:  # no time stamps in this format: TUM's file format gets the frame numbers
+        # no time stamps in this format: TUM's file format gets the frame numbers
+        if None in stamps:
             stamps = [step.index for step in self.steps]
-        trajectory = Trajectory(np.array(stamps, np.float64), np.array([T for _, T in self.poses]).reshape(-1, 4, 4))
-        return RunResult(tuple(self.steps), tuple(self.skipped), trajectory, tuple(self.warnings),
-                         time.perf_counter() - self.started, interrupted, failure)
+        trajectory = Trajectory(
+            np.array(stamps, np.float64), np.array([T for _, T in self.poses]).reshape(-1, 4, 4)
+        )
+        return RunResult(
+            tuple(self.steps),
+            tuple(self.skipped),
+            trajectory,
+            tuple(self.warnings),
+            time.perf_counter() - self.started,
+            interrupted,
+            failure,
+        )
 
     def _nothing_used(self) -> str:
         if not self.skipped:

@@ -1,7 +1,7 @@
 """The one place that starts Taichi: chooses CUDA or the CPU, says which, and remembers it.
 
-`ti.init` is global to the process, and a second one frees every field of the first: maps remember the runtime that they
-were made under (`current()`) and refuse to go on under another.
+`ti.init` is global to the process, and a second one frees every field of the first: maps remember
+the runtime that they were made under (`current()`) and refuse to go on under another.
 """
 
 from __future__ import annotations
@@ -31,35 +31,55 @@ class Runtime:
 
     device: str
     description: str
-    free_trees: list = field(default_factory=list, repr=False)  # index trees of maps that are gone: Taichi cannot free them
+    # index trees of maps that are gone: Taichi cannot free them
+    free_trees: list = field(default_factory=list, repr=False)
     trees: list = field(default_factory=lambda: [0], repr=False)
-    scratch: dict = field(default_factory=dict, repr=False)     # shape -> arrays that all use in turn
+    scratch: dict = field(default_factory=dict, repr=False)  # shape -> arrays that all use in turn
 
     def count_tree(self) -> None:
-        """Note that one more index tree is made; raises CapacityError before there are more than Taichi bears."""
+        """Note that one more index tree is made; raises CapacityError before there are more than
+        Taichi bears.
+        """
         if self.trees[0] >= MAX_TREES:
-            raise CapacityError(f"more than {MAX_TREES} maps live at once: delete or save some, or use another process")
+            raise CapacityError(
+                f"more than {MAX_TREES} maps live at once: delete or save some, or use another process"
+            )
         self.trees[0] += 1
 
 
 _runtime: Runtime | None = None
 
 
-def init(device: str = "auto", *, threads: int | None = None, device_memory_gb: float = 2.0, debug: bool = False) -> Runtime:
-    """Start Taichi on CUDA if there is one, else on the CPU, and say which; a second call with the same device does nothing.
+def init(
+    device: str = "auto",
+    *,
+    threads: int | None = None,
+    device_memory_gb: float = 2.0,
+    debug: bool = False,
+) -> Runtime:
+    """Start Taichi on CUDA if there is one, else on the CPU, and say which; a second call with the
+    same device does nothing.
 
-    `threads` caps the CPU threads, `device_memory_gb` is CUDA's fixed pool for sparse voxels, `debug` checks array bounds.
-    Raises InputError for an unknown device, RuntimeStateError where CUDA is asked for and absent, or another device is live.
+    `threads` caps the CPU threads, `device_memory_gb` is CUDA's fixed pool for sparse voxels,
+    `debug` checks array bounds. Raises InputError for an unknown device, RuntimeStateError where
+    CUDA is asked for and absent, or another device is live.
     """
     global _runtime
     check_choice("device", device, DEVICES)
     if _runtime is not None:
         if device in ("auto", _runtime.device):
             return _runtime
-        raise RuntimeStateError(f"device: Taichi already runs on {_runtime.device}; start a new process to use {device}")
+        raise RuntimeStateError(
+            f"device: Taichi already runs on {_runtime.device}; start a new process to use {device}"
+        )
     ti = _import_taichi()
-    _free_kernel_cache(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
-    options = dict(log_level=ti.ERROR, offline_cache=True, debug=debug, default_fp=ti.f32, default_ip=ti.i32)
+    _free_kernel_cache(
+        os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")
+        or ti.lang.impl.default_cfg().offline_cache_file_path
+    )
+    options = dict(
+        log_level=ti.ERROR, offline_cache=True, debug=debug, default_fp=ti.f32, default_ip=ti.i32
+    )
     if threads:
         options["cpu_max_num_threads"] = threads
     wanted = ti.cpu if device == "cpu" else ti.cuda  # never ti.gpu: Vulkan has no pointer SNodes
@@ -67,7 +87,9 @@ def init(device: str = "auto", *, threads: int | None = None, device_memory_gb: 
         ti.init(arch=wanted, device_memory_GB=device_memory_gb, **options)
     found = "cuda" if ti.lang.impl.current_cfg().arch == ti.cuda else "cpu"
     if device == "cuda" and found != "cuda":
-        raise RuntimeStateError("device: CUDA was asked for but Taichi finds none; use device 'cpu' or check the NVIDIA driver")
+        raise RuntimeStateError(
+            "device: CUDA was asked for but Taichi finds none; use device 'cpu' or check the NVIDIA driver"
+        )
     _runtime = Runtime(found, _describe(found, threads))
     _say(f"Taichi {'.'.join(map(str, ti.__version__))} on {_runtime.description}")
     return _runtime
@@ -81,8 +103,10 @@ def current() -> Runtime:
 def check_alive(runtime: Runtime) -> None:
     """Raise RuntimeStateError unless `runtime` is the live one."""
     if runtime is not _runtime:
-        raise RuntimeStateError("this map was made before Taichi was started again and its memory is gone; save maps first, "
-                                "then load them in the new process")
+        raise RuntimeStateError(
+            "this map was made before Taichi was started again and its memory is gone; save maps first, "
+            "then load them in the new process"
+        )
 
 
 def synchronize() -> None:
@@ -93,7 +117,9 @@ def synchronize() -> None:
 
 
 def _free_kernel_cache(folder: str) -> None:
-    """Remove the lock that a killed process left in Taichi's cache: under it every start would compile all kernels again."""
+    """Remove the lock that a killed process left in Taichi's cache: under it every start would
+    compile all kernels again.
+    """
     lock = Path(folder) / "ticache.lock"
     with suppress(OSError):
         if time.time() - lock.stat().st_mtime > STALE_LOCK:
@@ -113,7 +139,9 @@ def _import_taichi():
         import taichi
     except (ImportError, OSError) as error:
         if "libX11" in str(error):
-            raise MissingDependency("Taichi needs the system library libX11; run: apt-get install -y libx11-6") from error
+            raise MissingDependency(
+                "Taichi needs the system library libX11; run: apt-get install -y libx11-6"
+            ) from error
         raise
     return taichi
 

@@ -1,6 +1,7 @@
 """Values that travel through the pipeline: frozen, checked once at the door.
 
-Frames of reference: *camera* is x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a. Metres.
+Frames of reference: *camera* is x right, y down, z forward; `T_a_b` maps coordinates in b to
+coordinates in a. Metres.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ from numpy.typing import NDArray
 
 from .errors import FrameError, InputError, PoseError, SizeMismatch
 
-RIGID_TOLERANCE = 1e-3  # |R^T R - I| and |det R - 1|: text files of 6 digits pass, a scale of 0.1 % does not
+# |R^T R - I| and |det R - 1|: text files of 6 digits pass, a scale of 0.1 % does not
+RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Pinhole intrinsics without distortion: u = fx x / z + cx, v = fy y / z + cy, pixel centres at integers."""
+    """Pinhole intrinsics without distortion: u = fx x / z + cx, v = fy y / z + cy, pixel centres at
+    integers.
+    """
 
     width: int
     height: int
@@ -30,13 +34,17 @@ class PinholeCamera:
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy)
         if not all(np.isfinite(numbers)) or self.fx <= 0 or self.fy <= 0:
-            raise InputError(f"camera: fx, fy must be positive and all intrinsics finite, got fx={self.fx} fy={self.fy} "
-                             f"cx={self.cx} cy={self.cy}")
+            raise InputError(
+                f"camera: fx, fy must be positive and all intrinsics finite, got fx={self.fx} fy={self.fy} "
+                f"cx={self.cx} cy={self.cy}"
+            )
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: image size must be positive, got {self.width}x{self.height}")
         if not (0 <= self.cx <= self.width and 0 <= self.cy <= self.height):
-            raise InputError(f"camera: principal point ({self.cx}, {self.cy}) lies outside the "
-                             f"{self.width}x{self.height} image; are these the intrinsics of another resolution?")
+            raise InputError(
+                f"camera: principal point ({self.cx}, {self.cy}) lies outside the "
+                f"{self.width}x{self.height} image; are these the intrinsics of another resolution?"
+            )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -51,41 +59,60 @@ class PinholeCamera:
     def resized(self, width: int, height: int) -> PinholeCamera:
         """The same camera for the image resampled to width x height (pixel centres at integers)."""
         sx, sy = width / self.width, height / self.height
-        return PinholeCamera(width, height, self.fx * sx, self.fy * sy,
-                             (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
+        return PinholeCamera(
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+        )
 
 
 def check_rigid(T: NDArray, name: str = "T_world_camera") -> NDArray[np.float64]:
-    """Return T as a (4, 4) float64 rigid transform, or raise PoseError with the numbers that are off."""
+    """Return T as a (4, 4) float64 rigid transform, or raise PoseError with the numbers that are
+    off.
+    """
     T = np.asarray(T, dtype=np.float64)
     if T.shape != (4, 4):
         raise PoseError(f"{name}: expected a 4x4 matrix, got shape {T.shape}")
     if not np.isfinite(T).all():
         raise PoseError(f"{name}: holds NaN or infinite numbers")
     if not np.allclose(T[3], (0, 0, 0, 1), atol=1e-6):
-        raise PoseError(f"{name}: last row is {T[3].tolist()}, not 0 0 0 1; is the matrix transposed?")
+        raise PoseError(
+            f"{name}: last row is {T[3].tolist()}, not 0 0 0 1; is the matrix transposed?"
+        )
     R = T[:3, :3]
     det, skew = float(np.linalg.det(R)), float(np.abs(R.T @ R - np.eye(3)).max())
     if abs(det - 1) > RIGID_TOLERANCE or skew > RIGID_TOLERANCE:
-        raise PoseError(f"{name}: not a rotation (det R = {det:.4f}, max |R^T R - I| = {skew:.4f}; "
-                        f"both must be within {RIGID_TOLERANCE} of 1 and 0)")
+        raise PoseError(
+            f"{name}: not a rotation (det R = {det:.4f}, max |R^T R - I| = {skew:.4f}; "
+            f"both must be within {RIGID_TOLERANCE} of 1 and 0)"
+        )
     return T
 
 
 @dataclass(frozen=True)
 class FeatureImage:
-    """An image of high-dimensional features, as small as its network made it, and where it was taken from."""
+    """An image of high-dimensional features, as small as its network made it, and where it was
+    taken from.
+    """
 
-    values: NDArray[np.float32]              # (h, w, c); pixels that are not finite are left out
-    camera: PinholeCamera                    # of this image: w x h
-    T_camera_cloud: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))  # (4, 4) from the points it belongs to
+    values: NDArray[np.float32]  # (h, w, c); pixels that are not finite are left out
+    camera: PinholeCamera  # of this image: w x h
+    # (4, 4) from the points it belongs to
+    T_camera_cloud: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
         if self.values.ndim != 3 or self.values.dtype != np.float32:
-            raise FrameError(f"feature image: must be (h, w, c) float32, got {self.values.shape} {self.values.dtype}")
+            raise FrameError(
+                f"feature image: must be (h, w, c) float32, got {self.values.shape} {self.values.dtype}"
+            )
         if self.values.shape[1::-1] != self.camera.size:
-            raise SizeMismatch(f"feature image: is {self.values.shape[1]}x{self.values.shape[0]} but its camera is "
-                               f"{self.camera.width}x{self.camera.height}")
+            raise SizeMismatch(
+                f"feature image: is {self.values.shape[1]}x{self.values.shape[0]} but its camera is "
+                f"{self.camera.width}x{self.camera.height}"
+            )
 
     def transformed(self, T_b_a: NDArray) -> FeatureImage:
         """The same image for points that were given in frame a and now are in frame b."""
@@ -96,53 +123,74 @@ class FeatureImage:
 class Frame:
     """One RGB-D image with its camera and, if known, its pose."""
 
-    depth: NDArray[np.float32]                            # (H, W) [m]; 0, negative, NaN, inf: no reading
-    camera: PinholeCamera                                 # of the depth image
-    color: NDArray[np.uint8] | None = None                # (H, W, 3) RGB
-    T_world_camera: NDArray[np.float64] | None = None     # (4, 4)
-    index: int = 0                                        # place in its sequence
-    timestamp: float | None = None                        # [s]
-    name: str = ""                                        # where it came from, for messages
-    images: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)  # property images, (H, W, c)
-    features: Mapping[str, FeatureImage] = field(default_factory=dict)       # of any size, (h, w, c)
+    depth: NDArray[np.float32]  # (H, W) [m]; 0, negative, NaN, inf: no reading
+    camera: PinholeCamera  # of the depth image
+    color: NDArray[np.uint8] | None = None  # (H, W, 3) RGB
+    T_world_camera: NDArray[np.float64] | None = None  # (4, 4)
+    index: int = 0  # place in its sequence
+    timestamp: float | None = None  # [s]
+    name: str = ""  # where it came from, for messages
+    # property images, (H, W, c)
+    images: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    features: Mapping[str, FeatureImage] = field(default_factory=dict)  # of any size, (h, w, c)
 
     def __post_init__(self) -> None:
         at = f"frame {self.name or self.index}"
         if self.depth.ndim != 2 or self.depth.dtype != np.float32:
-            raise FrameError(f"{at}: depth must be (H, W) float32 in metres, got {self.depth.shape} {self.depth.dtype}")
+            raise FrameError(
+                f"{at}: depth must be (H, W) float32 in metres, got {self.depth.shape} {self.depth.dtype}"
+            )
         height, width = self.depth.shape
         if (width, height) != self.camera.size:
-            raise SizeMismatch(f"{at}: depth is {width}x{height} but the camera is {self.camera.width}x{self.camera.height}")
+            raise SizeMismatch(
+                f"{at}: depth is {width}x{height} but the camera is {self.camera.width}x{self.camera.height}"
+            )
         if self.color is not None:
             if self.color.ndim != 3 or self.color.shape[2] != 3 or self.color.dtype != np.uint8:
-                raise FrameError(f"{at}: color must be (H, W, 3) uint8 RGB, got {self.color.shape} {self.color.dtype}")
+                raise FrameError(
+                    f"{at}: color must be (H, W, 3) uint8 RGB, got {self.color.shape} {self.color.dtype}"
+                )
             self._check_size(at, "color", self.color)
         for name, image in self.images.items():
             if image.ndim != 3 or image.dtype != np.float32:
-                raise FrameError(f"{at}: image '{name}' must be (H, W, c) float32, got {image.shape} {image.dtype}")
+                raise FrameError(
+                    f"{at}: image '{name}' must be (H, W, c) float32, got {image.shape} {image.dtype}"
+                )
             self._check_size(at, f"image '{name}'", image)
         if self.T_world_camera is not None:
-            object.__setattr__(self, "T_world_camera", check_rigid(self.T_world_camera, f"{at}: T_world_camera"))
+            object.__setattr__(
+                self, "T_world_camera", check_rigid(self.T_world_camera, f"{at}: T_world_camera")
+            )
 
     def _check_size(self, at: str, what: str, image: NDArray) -> None:
         if image.shape[:2] != self.depth.shape:
-            raise SizeMismatch(f"{at}: {what} is {image.shape[1]}x{image.shape[0]} but depth is "
-                               f"{self.depth.shape[1]}x{self.depth.shape[0]}; register or resize one of them")
+            raise SizeMismatch(
+                f"{at}: {what} is {image.shape[1]}x{image.shape[0]} but depth is "
+                f"{self.depth.shape[1]}x{self.depth.shape[0]}; register or resize one of them"
+            )
 
     def with_image(self, name: str, image: NDArray) -> Frame:
         """A copy that also carries the property image `name`, (H, W) or (H, W, c)."""
         image = np.ascontiguousarray(image, dtype=np.float32)
-        return replace(self, images={**self.images, name: image[..., None] if image.ndim == 2 else image})
+        return replace(
+            self, images={**self.images, name: image[..., None] if image.ndim == 2 else image}
+        )
 
     def without_image(self, name: str) -> Frame:
         """A copy that lacks the property image `name`."""
-        return replace(self, images={key: image for key, image in self.images.items() if key != name})
+        return replace(
+            self, images={key: image for key, image in self.images.items() if key != name}
+        )
 
     def with_features(self, name: str, values: NDArray) -> Frame:
-        """A copy that also carries the feature image `name`, (h, w, c), of the same view at any resolution."""
+        """A copy that also carries the feature image `name`, (h, w, c), of the same view at any
+        resolution.
+        """
         values = np.ascontiguousarray(values, dtype=np.float32)
         if values.ndim != 3:
-            raise FrameError(f"frame {self.name or self.index}: features '{name}' must be (h, w, c), got {values.shape}")
+            raise FrameError(
+                f"frame {self.name or self.index}: features '{name}' must be (h, w, c), got {values.shape}"
+            )
         image = FeatureImage(values, self.camera.resized(values.shape[1], values.shape[0]))
         return replace(self, features={**self.features, name: image})
 
@@ -151,41 +199,69 @@ class Frame:
 class DepthView:
     """From where a cloud was seen: what lies between the camera and the readings is free."""
 
-    depth: NDArray[np.float32]            # (H, W) [m]; 0: no reading
+    depth: NDArray[np.float32]  # (H, W) [m]; 0: no reading
     camera: PinholeCamera
-    T_camera_cloud: NDArray[np.float64]   # (4, 4) from the cloud's frame of reference to the camera's
+    # (4, 4) from the cloud's frame of reference to the camera's
+    T_camera_cloud: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        if self.depth.shape != (self.camera.height, self.camera.width) or self.depth.dtype != np.float32:
-            raise SizeMismatch(f"depth view: depth must be ({self.camera.height}, {self.camera.width}) float32 as the camera "
-                               f"is, got {self.depth.shape} {self.depth.dtype}")
+        if (
+            self.depth.shape != (self.camera.height, self.camera.width)
+            or self.depth.dtype != np.float32
+        ):
+            raise SizeMismatch(
+                f"depth view: depth must be ({self.camera.height}, {self.camera.width}) float32 as the camera "
+                f"is, got {self.depth.shape} {self.depth.dtype}"
+            )
         if not np.isfinite(self.depth.sum()):
             raise InputError("depth view: depth holds NaN or infinite numbers; 0 means no reading")
         object.__setattr__(self, "depth", np.ascontiguousarray(self.depth))  # as kernels take it
-        object.__setattr__(self, "T_camera_cloud", check_rigid(self.T_camera_cloud, "T_camera_cloud"))
+        object.__setattr__(
+            self, "T_camera_cloud", check_rigid(self.T_camera_cloud, "T_camera_cloud")
+        )
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points with unit normals towards the camera and any sampled properties, all in one frame of reference."""
+    """Points with unit normals towards the camera and any sampled properties, all in one frame of
+    reference.
+    """
 
-    points: NDArray[np.float32]                # (N, 3) [m]
+    points: NDArray[np.float32]  # (N, 3) [m]
     normals: NDArray[np.float32] | None = None  # (N, 3) unit, towards the camera
-    attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)  # name -> (N, c); "color" is RGB in [0, 1]
-    view: DepthView | None = None              # from where it was seen, if that is known
-    features: Mapping[str, FeatureImage] = field(default_factory=dict)  # images that see these points
+    # name -> (N, c); "color" is RGB in [0, 1]
+    attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    view: DepthView | None = None  # from where it was seen, if that is known
+    # images that see these points
+    features: Mapping[str, FeatureImage] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, array, columns in (("points", self.points, 3), ("normals", self.normals, 3),
-                                     *((f"attribute '{k}'", v, None) for k, v in self.attributes.items())):
+        for name, array, columns in (
+            ("points", self.points, 3),
+            ("normals", self.normals, 3),
+            *((f"attribute '{k}'", v, None) for k, v in self.attributes.items()),
+        ):
             if array is None:
                 continue
-            if array.ndim != 2 or (columns and array.shape[1] != columns) or array.dtype != np.float32:
-                raise InputError(f"point cloud: {name} must be (N, {columns or 'c'}) float32, got {array.shape} {array.dtype}")
+            if (
+                array.ndim != 2
+                or (columns and array.shape[1] != columns)
+                or array.dtype != np.float32
+            ):
+                raise InputError(
+                    f"point cloud: {name} must be (N, {columns or 'c'}) float32, got {array.shape} {array.dtype}"
+                )
             if len(array) != len(self.points):
-                raise InputError(f"point cloud: {len(self.points)} points but {len(array)} rows of {name}")
-        object.__setattr__(self, "points", np.ascontiguousarray(self.points))  # as kernels take them
-        object.__setattr__(self, "attributes", {name: np.ascontiguousarray(v) for name, v in self.attributes.items()})
+                raise InputError(
+                    f"point cloud: {len(self.points)} points but {len(array)} rows of {name}"
+                )
+        # as kernels take them
+        object.__setattr__(self, "points", np.ascontiguousarray(self.points))
+        object.__setattr__(
+            self,
+            "attributes",
+            {name: np.ascontiguousarray(v) for name, v in self.attributes.items()},
+        )
         if self.normals is not None:
             object.__setattr__(self, "normals", np.ascontiguousarray(self.normals))
 
@@ -197,17 +273,24 @@ class PointCloud:
         from . import runtime
 
         runtime.current()
-        from .kernels.images import transform  # Taichi starts with the first kernel, not with the first type
+        from .kernels.images import (
+            transform,  # Taichi starts with the first kernel, not with the first type
+        )
 
         T_b_a = check_rigid(T_b_a, "T_b_a")
         T = T_b_a.astype(np.float32)
         rotation = np.hstack([T[:3, :3], np.zeros((3, 1), np.float32)])
         moved = []
-        for vectors, matrix in ((self.points, np.ascontiguousarray(T[:3])), (self.normals, rotation)):
+        for vectors, matrix in (
+            (self.points, np.ascontiguousarray(T[:3])),
+            (self.normals, rotation),
+        ):
             moved.append(None if vectors is None else np.empty_like(vectors))
             if vectors is not None and len(vectors):
                 transform(np.ascontiguousarray(vectors), matrix, moved[-1])
-        view = self.view and replace(self.view, T_camera_cloud=self.view.T_camera_cloud @ np.linalg.inv(T_b_a))
+        view = self.view and replace(
+            self.view, T_camera_cloud=self.view.T_camera_cloud @ np.linalg.inv(T_b_a)
+        )
         features = {name: image.transformed(T_b_a) for name, image in self.features.items()}
         return replace(self, points=moved[0], normals=moved[1], view=view, features=features)
 
@@ -216,10 +299,11 @@ class PointCloud:
 class Mesh:
     """A triangle mesh, welded and indexed."""
 
-    vertices: NDArray[np.float32]               # (V, 3) [m]
-    faces: NDArray[np.int32]                    # (F, 3), counter-clockwise seen from outside (from free space)
+    vertices: NDArray[np.float32]  # (V, 3) [m]
+    faces: NDArray[np.int32]  # (F, 3), counter-clockwise seen from outside (from free space)
     normals: NDArray[np.float32] | None = None  # (V, 3) unit, into free space
-    attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)  # name -> (V, c); "color" is RGB in [0, 1]
+    # name -> (V, c); "color" is RGB in [0, 1]
+    attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3:
@@ -228,12 +312,17 @@ class Mesh:
             raise InputError(f"mesh: faces must be (F, 3), got {self.faces.shape}")
         for name, array in (("normals", self.normals), *self.attributes.items()):
             if array is not None and len(array) != len(self.vertices):
-                raise InputError(f"mesh: {len(self.vertices)} vertices but {len(array)} rows of {name}")
+                raise InputError(
+                    f"mesh: {len(self.vertices)} vertices but {len(array)} rows of {name}"
+                )
 
     def with_attribute(self, name: str, values: NDArray) -> Mesh:
         """A copy with `values`, (V,) or (V, c), at the vertices under `name`."""
         values = np.ascontiguousarray(values, dtype=np.float32)
-        return replace(self, attributes={**self.attributes, name: values[:, None] if values.ndim == 1 else values})
+        return replace(
+            self,
+            attributes={**self.attributes, name: values[:, None] if values.ndim == 1 else values},
+        )
 
     def save(self, path) -> None:
         """Write the mesh; the suffix chooses PLY, GLB or OBJ."""
@@ -246,14 +335,16 @@ class Mesh:
 class Trajectory:
     """Camera poses in time order."""
 
-    timestamps: NDArray[np.float64]      # (N,) [s]
+    timestamps: NDArray[np.float64]  # (N,) [s]
     T_world_camera: NDArray[np.float64]  # (N, 4, 4)
 
     def __post_init__(self) -> None:
         n = len(self.timestamps)
         if self.timestamps.shape != (n,) or self.T_world_camera.shape != (n, 4, 4):
-            raise InputError(f"trajectory: expected (N,) and (N, 4, 4), got {self.timestamps.shape} and "
-                             f"{self.T_world_camera.shape}")
+            raise InputError(
+                f"trajectory: expected (N,) and (N, 4, 4), got {self.timestamps.shape} and "
+                f"{self.T_world_camera.shape}"
+            )
 
     def __len__(self) -> int:
         return len(self.timestamps)

@@ -11,11 +11,15 @@ import pytest
 import taichi_unifusion as uf
 
 DEVICE = os.environ.get("UNIFUSION_DEVICE", "cpu")
-DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+DATA = Path(
+    os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
+)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "data: reads a real recording; skipped where it is not at hand")
+    config.addinivalue_line(
+        "markers", "data: reads a real recording; skipped where it is not at hand"
+    )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -33,6 +37,7 @@ def runtime():
 @pytest.fixture(scope="session")
 def data() -> Callable[[str], Path]:
     """Folder of a named recording, or a skip that says where it was looked for."""
+
     def folder(name: str) -> Path:
         if not (DATA / name).is_dir():
             pytest.skip(f"no {name} in {DATA}; set UNIFUSION_DATA to a folder that has it")

@@ -1,4 +1,6 @@
-"""What a stranger meets before the first frame: set-up (K1), imports and --help (K2), and what the repository holds."""
+"""What a stranger meets before the first frame: set-up (K1), imports and --help (K2), and what the
+repository holds.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ PACKAGE = ROOT / "taichi_unifusion"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 MAX_IMPORT_S = 1.5  # K2; the best of three, so that a busy machine does not decide
-HEAVY = {"torch", "open3d", "trimesh"}  # each more than a second of import, none needed to reconstruct
+# each more than a second of import, none needed to reconstruct
+HEAVY = {"torch", "open3d", "trimesh"}
 MAX_FILE_BYTES = 1 << 20
 MAX_REPOSITORY_BYTES = 6 << 20
 IMPORT_NAMES = {"cv2": "opencv-python-headless", "skimage": "scikit-image", "yaml": "pyyaml"}
@@ -30,10 +33,18 @@ IMPORT_NAMES = {"cv2": "opencv-python-headless", "skimage": "scikit-image", "yam
 
 
 def modules_after(code: str) -> tuple[set[str], float]:
-    """Top-level modules that a fresh interpreter holds after `code`, and its wall time, start included [s]."""
+    """Top-level modules that a fresh interpreter holds after `code`, and its wall time, start
+    included [s].
+    """
     report = "import json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})), file=sys.stderr)"
     start = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", f"{code}\n{report}"], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     seconds = time.perf_counter() - start
     assert done.returncode == 0, done.stderr
     return set(json.loads(done.stderr.splitlines()[-1])), seconds
@@ -48,7 +59,9 @@ def run_main(*arguments: str) -> str:
     )
 
 
-@pytest.mark.parametrize("code", ["import taichi_unifusion", run_main("--help")], ids=["import", "help"])
+@pytest.mark.parametrize(
+    "code", ["import taichi_unifusion", run_main("--help")], ids=["import", "help"]
+)
 def test_K2_import_and_help_are_quick_and_leave_taichi_alone(code: str) -> None:
     runs = [modules_after(code) for _ in range(3)]
     assert not runs[0][0] & (HEAVY | {"taichi"})
@@ -56,12 +69,16 @@ def test_K2_import_and_help_are_quick_and_leave_taichi_alone(code: str) -> None:
 
 
 def test_K2_every_public_name_resolves_without_heavy_imports() -> None:
-    modules, _ = modules_after("import taichi_unifusion as uf\nassert uf.__all__\nfor name in uf.__all__: getattr(uf, name)")
+    modules, _ = modules_after(
+        "import taichi_unifusion as uf\nassert uf.__all__\nfor name in uf.__all__: getattr(uf, name)"
+    )
     assert not modules & HEAVY
 
 
 def third_party_imports(body: list[ast.stmt]) -> set[str]:
-    """Top-level names of the installed packages that these statements import, functions and classes included."""
+    """Top-level names of the installed packages that these statements import, functions and classes
+    included.
+    """
     names = set()
     for node in (inner for statement in body for inner in ast.walk(statement)):
         if isinstance(node, ast.Import):
@@ -80,7 +97,9 @@ def test_every_import_is_a_declared_dependency() -> None:
     undeclared = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         body = ast.parse(path.read_text()).body
-        at_import = third_party_imports([s for s in body if isinstance(s, ast.Import | ast.ImportFrom)])
+        at_import = third_party_imports(
+            [s for s in body if isinstance(s, ast.Import | ast.ImportFrom)]
+        )
         lacking = {n for n in at_import if IMPORT_NAMES.get(n, n) not in core}
         lacking |= {n for n in third_party_imports(body) if IMPORT_NAMES.get(n, n) not in anywhere}
         if lacking:
@@ -114,14 +133,22 @@ def python_with(folder: Path, module: str, source: str) -> Path:
     """This Python with one module of its library replaced."""
     (folder / "modules").mkdir()
     (folder / "modules" / f"{module}.py").write_text(source)
-    return write_program(folder / "python", f"PYTHONPATH='{folder}/modules' exec '{sys.executable}' \"$@\"")
+    return write_program(
+        folder / "python", f"PYTHONPATH='{folder}/modules' exec '{sys.executable}' \"$@\""
+    )
 
 
 def run_setup(clone: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     path = f"{clone.parent / 'bin'}{os.pathsep}{os.environ['PATH']}"
     inherited = {name: value for name, value in os.environ.items() if name != "PYTHON"}
     script = ["bash", str(clone / "scripts" / "setup.sh")]
-    return subprocess.run(script, env={**inherited, "PATH": path, **environment}, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        script,
+        env={**inherited, "PATH": path, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def test_K1_unsuitable_python_is_named_with_the_suitable_ones(bare_clone: Path) -> None:
@@ -133,8 +160,12 @@ def test_K1_unsuitable_python_is_named_with_the_suitable_ones(bare_clone: Path) 
     assert done.stderr.count("\n") == 1 and not (bare_clone / ".venv").exists()
 
 
-@pytest.mark.parametrize(("module", "package"), [("ensurepip", r"python3\.1[123]-venv"), ("ctypes", "libx11-6")])
-def test_K1_missing_system_package_is_one_sentence_with_the_command(bare_clone: Path, module: str, package: str) -> None:
+@pytest.mark.parametrize(
+    ("module", "package"), [("ensurepip", r"python3\.1[123]-venv"), ("ctypes", "libx11-6")]
+)
+def test_K1_missing_system_package_is_one_sentence_with_the_command(
+    bare_clone: Path, module: str, package: str
+) -> None:
     python = python_with(bare_clone.parent, module, "raise ImportError")
     done = run_setup(bare_clone, PYTHON=str(python))
     assert done.returncode == 1
@@ -143,8 +174,12 @@ def test_K1_missing_system_package_is_one_sentence_with_the_command(bare_clone: 
 
 
 def test_K1_finished_setup_is_left_alone_until_the_project_changes(bare_clone: Path) -> None:
-    """Also: an Open3D that cannot be had is one sentence, not a failure. The environment's pip only says that it was called."""
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", bare_clone / ".venv"], check=True)
+    """Also: an Open3D that cannot be had is one sentence, not a failure. The environment's pip only
+    says that it was called.
+    """
+    subprocess.run(
+        [sys.executable, "-m", "venv", "--without-pip", bare_clone / ".venv"], check=True
+    )
     pip = next((bare_clone / ".venv").glob("lib/python3*/site-packages")) / "pip"
     pip.mkdir()
     (pip / "__main__.py").write_text("print('pip called')")
@@ -165,7 +200,9 @@ def test_K1_finished_setup_is_left_alone_until_the_project_changes(bare_clone: P
 def tracked_files() -> list[Path]:
     if not shutil.which("git"):
         pytest.skip("git is not installed")
-    listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    listing = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     if not listing.stdout:
         pytest.skip("not a git clone with tracked files")
     return [path for name in listing.stdout.split("\0") if name and (path := ROOT / name).is_file()]
@@ -178,8 +215,13 @@ def test_repository_stays_small(tracked_files: list[Path]) -> None:
 
 
 def test_no_tracked_file_names_a_place_on_somebodys_machine(tracked_files: list[Path]) -> None:
-    personal = re.compile(rb"(?:^|[\s\"'`(=:,])(/(?:home|root|Users|work|workspace|mnt)/[A-Za-z0-9_.-]+)", re.MULTILINE)
-    found = {str(path.relative_to(ROOT)): personal.findall(path.read_bytes()) for path in tracked_files}
+    personal = re.compile(
+        rb"(?:^|[\s\"'`(=:,])(/(?:home|root|Users|work|workspace|mnt)/[A-Za-z0-9_.-]+)",
+        re.MULTILINE,
+    )
+    found = {
+        str(path.relative_to(ROOT)): personal.findall(path.read_bytes()) for path in tracked_files
+    }
     assert {name: places for name, places in found.items() if places} == {}
 
 

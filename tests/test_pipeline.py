@@ -11,9 +11,9 @@ import pytest
 from tiny_recording import CONFIG, make_frames, write_folder
 
 from taichi_unifusion.datasets import open_dataset
+from taichi_unifusion.datasets.loading import load_ahead
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.errors import DatasetError, FrameError, OutOfRange, PoseError
-from taichi_unifusion.datasets.loading import load_ahead
 from taichi_unifusion.maps import Integration
 from taichi_unifusion.pipeline import Pipeline, extract_mesh
 from taichi_unifusion.preprocessing import PreprocessSettings
@@ -88,7 +88,9 @@ def without_depth(frame):
 
 def points_of(pipeline) -> list[list[bytes]]:
     """What was integrated into every map."""
-    return [[cloud.points.tobytes() for cloud in target.clouds] for target in pipeline.maps.values()]
+    return [
+        [cloud.points.tobytes() for cloud in target.clouds] for target in pipeline.maps.values()
+    ]
 
 
 def test_S5_one_frame_gives_a_coloured_mesh(frames):
@@ -96,7 +98,9 @@ def test_S5_one_frame_gives_a_coloured_mesh(frames):
     step = pipeline.step(frames[0])
     assert 0 < step.points <= frames[0].depth.size
     assert {name: done.total_voxels for name, done in step.integrations.items()} == {
-        "surface": len(pipeline.surface), "color": len(pipeline.properties["color"])}
+        "surface": len(pipeline.surface),
+        "color": len(pipeline.properties["color"]),
+    }
     assert min(done.total_voxels for done in step.integrations.values()) > 0
     assert list(step.milliseconds) == STAGES[1:] and min(step.milliseconds.values()) > 0
     mesh = pipeline.extract_mesh()
@@ -110,7 +114,10 @@ def test_a_run_fuses_all_frames(fused, frames):
     assert result.steps[-1].integrations["surface"].total_voxels == len(pipeline.surface) > 0
     mesh = pipeline.extract_mesh()
     values, valid = pipeline.surface.sdf(mesh.vertices)
-    assert valid.mean() > 0.99 and np.abs(values[valid]).max() < CONFIG.surface.voxel_size / CONFIG.mesh.resolution
+    assert (
+        valid.mean() > 0.99
+        and np.abs(values[valid]).max() < CONFIG.surface.voxel_size / CONFIG.mesh.resolution
+    )
 
 
 def test_a_run_is_its_steps_in_order(pipeline, frames):
@@ -122,18 +129,39 @@ def test_a_run_is_its_steps_in_order(pipeline, frames):
     assert points_of(pipeline) == points_of(by_hand) and len(points_of(pipeline)[0]) == 3
     assert [step.index for step in result.steps] == [0, 1, 2] and told == [(1, 3), (2, 3), (3, 3)]
     assert all(list(step.milliseconds) == STAGES for step in result.steps)
-    assert (result.skipped, result.warnings, result.interrupted, result.failure) == ((), (), False, None)
-    np.testing.assert_array_equal(result.trajectory.T_world_camera, [frame.T_world_camera for frame in frames])
-    np.testing.assert_array_equal(result.trajectory.timestamps, [frame.timestamp for frame in frames])
+    assert (result.skipped, result.warnings, result.interrupted, result.failure) == (
+        (),
+        (),
+        False,
+        None,
+    )
+    np.testing.assert_array_equal(
+        result.trajectory.T_world_camera, [frame.T_world_camera for frame in frames]
+    )
+    np.testing.assert_array_equal(
+        result.trajectory.timestamps, [frame.timestamp for frame in frames]
+    )
 
 
-@pytest.mark.parametrize(("spoil", "reason"), [
-    (without_depth, "the depth image holds no reading at all"),                                        # F1
-    (lambda frame: replace(frame, depth=np.full_like(frame.depth, np.nan)), "no reading at all"),      # F2
-    (lambda frame: replace(frame, depth=frame.depth + np.float32(20)), "lie outside 0.1..5 m"),        # F10
-    (with_one_reading, "all 1 depth readings"),                                                        # F4
-], ids=["F1", "F2", "F10", "F4"])
-def test_F1_F2_F4_F10_a_frame_without_usable_depth_is_skipped_counted_and_said(pipeline, frames, spoil, reason, caplog):
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (without_depth, "the depth image holds no reading at all"),  # F1
+        (
+            lambda frame: replace(frame, depth=np.full_like(frame.depth, np.nan)),
+            "no reading at all",
+        ),  # F2
+        (
+            lambda frame: replace(frame, depth=frame.depth + np.float32(20)),
+            "lie outside 0.1..5 m",
+        ),  # F10
+        (with_one_reading, "all 1 depth readings"),  # F4
+    ],
+    ids=["F1", "F2", "F10", "F4"],
+)
+def test_F1_F2_F4_F10_a_frame_without_usable_depth_is_skipped_counted_and_said(
+    pipeline, frames, spoil, reason, caplog
+):
     result = pipeline.run([frames[0], spoil(frames[1]), frames[2]])
     others = Pipeline(CONFIG)
     others.run([frames[0], frames[2]])
@@ -141,7 +169,11 @@ def test_F1_F2_F4_F10_a_frame_without_usable_depth_is_skipped_counted_and_said(p
     (skipped,) = result.skipped
     assert (skipped.index, skipped.reason, len(result.steps)) == (1, SKIP_REASONS[EmptyFrame], 2)
     assert reason in skipped.message and frames[1].name in skipped.message
-    assert [skipped.message in record.message for record in caplog.records if record.levelno == logging.WARNING] == [True]
+    assert [
+        skipped.message in record.message
+        for record in caplog.records
+        if record.levelno == logging.WARNING
+    ] == [True]
 
 
 def test_a_frame_without_pose_is_skipped(pipeline, frames):
@@ -158,18 +190,28 @@ def test_a_pose_beyond_the_index_range_is_skipped(fused, frames):
     with pytest.raises(OutOfRange):
         pipeline.step(far)
     result = pipeline.run([far, frames[1]])
-    assert [frame.reason for frame in result.skipped] == ["outside the range of the map"] and len(result.steps) == 1
+    assert [frame.reason for frame in result.skipped] == ["outside the range of the map"] and len(
+        result.steps
+    ) == 1
     assert len(pipeline.surface) == before
 
 
 def test_F7_every_kind_of_trouble_is_warned_of_once(pipeline, frames, caplog):
     bad = [FrameError(f"frame {i}.png: truncated") for i in range(3)]
     result = pipeline.run(Sequence(bad[0], PoseError("p.txt: NaN"), frames[0], bad[1], bad[2]))
-    assert [frame.message for frame in result.skipped] == ["frame 0.png: truncated", "p.txt: NaN", "frame 1.png: truncated",
-                                                            "frame 2.png: truncated"]
-    assert result.warnings == tuple(record.message for record in caplog.records if record.levelno == logging.WARNING)
+    assert [frame.message for frame in result.skipped] == [
+        "frame 0.png: truncated",
+        "p.txt: NaN",
+        "frame 1.png: truncated",
+        "frame 2.png: truncated",
+    ]
+    assert result.warnings == tuple(
+        record.message for record in caplog.records if record.levelno == logging.WARNING
+    )
     assert [warning.partition(": ")[0] for warning in result.warnings] == [
-        "frame skipped, unreadable image", "frame skipped, no usable pose"]
+        "frame skipped, unreadable image",
+        "frame skipped, no usable pose",
+    ]
 
 
 def test_S1_a_missing_file_in_the_middle_costs_one_frame(pipeline, frames, tmp_path):
@@ -184,13 +226,19 @@ def test_indices_are_those_of_the_recording_behind_views(pipeline, frames, tmp_p
     folder = write_folder(tmp_path / "recording", [*frames, *frames])
     (folder / "depth" / "3.png").write_bytes(b"no image")
     result = pipeline.run(open_dataset("folder", folder)[1:][::2])
-    assert [step.index for step in result.steps] == [1, 5] and [frame.index for frame in result.skipped] == [3]
-    np.testing.assert_array_equal(result.trajectory.timestamps, [1, 5])  # no time stamps in this recording: frame numbers
+    assert [step.index for step in result.steps] == [1, 5] and [
+        frame.index for frame in result.skipped
+    ] == [3]
+    # no time stamps in this recording: frame numbers
+    np.testing.assert_array_equal(result.trajectory.timestamps, [1, 5])
 
 
 def test_no_usable_frame_is_an_error_with_the_most_common_reason(pipeline, frames):
     empty = without_depth(frames[0])
-    with pytest.raises(DatasetError, match=r"test sequence: none of 3 frames could be used, 2 for 'no usable depth' \(first: "):
+    with pytest.raises(
+        DatasetError,
+        match=r"test sequence: none of 3 frames could be used, 2 for 'no usable depth' \(first: ",
+    ):
         pipeline.run(Sequence(PoseError("p.txt: NaN"), empty, empty))
     with pytest.raises(DatasetError, match="no frames"):
         pipeline.run([])
@@ -206,7 +254,9 @@ def test_strict_ends_at_the_first_bad_frame_with_what_was_done(pipeline, frames)
 
 def test_R3_a_stop_ends_after_the_current_frame(pipeline, frames):
     done = []
-    result = pipeline.run(frames, stop=lambda: len(done) == 2, on_frame=lambda count, total: done.append(count))
+    result = pipeline.run(
+        frames, stop=lambda: len(done) == 2, on_frame=lambda count, total: done.append(count)
+    )
     assert result.interrupted and len(result.steps) == len(result.trajectory) == 2
     nothing = Pipeline(CONFIG).run(frames, stop=lambda: True)
     assert nothing.interrupted and not nothing.steps and len(nothing.trajectory) == 0
@@ -216,7 +266,9 @@ def test_F9_a_wrong_depth_scale_is_warned_of(pipeline, frames, tmp_path):
     frames = open_dataset("folder", write_folder(tmp_path / "recording", frames), depth_scale=25.0)
     pipeline.config = replace(CONFIG, preprocess=PreprocessSettings(depth_max=1000))
     result = pipeline.run(frames)
-    assert [("depth_scale 1000" in warning, "0.png" in warning) for warning in result.warnings] == [(True, True)]
+    assert [("depth_scale 1000" in warning, "0.png" in warning) for warning in result.warnings] == [
+        (True, True)
+    ]
     with pytest.raises(DatasetError, match=r"lie outside 0.1..5 m \(median"):
         Pipeline(CONFIG).run(frames)
 
@@ -264,7 +316,9 @@ def test_the_next_frame_loads_while_this_one_is_used():
 
 def test_what_renders_with_kernels_is_loaded_by_the_caller(monkeypatch):
     threads = []
-    monkeypatch.setattr(SyntheticRoom, "load", lambda self, index: threads.append(threading.current_thread()))
+    monkeypatch.setattr(
+        SyntheticRoom, "load", lambda self, index: threads.append(threading.current_thread())
+    )
     for load in load_ahead(SyntheticRoom(frames=4, width=16, height=12)[::2][:2]):
         load()
     assert threads == [threading.main_thread()] * 2

@@ -1,4 +1,6 @@
-"""Frame -> PointCloud: the image kernels against their twins, and what must and must not become a point."""
+"""Frame -> PointCloud: the image kernels against their twins, and what must and must not become a
+point.
+"""
 
 from __future__ import annotations
 
@@ -13,27 +15,35 @@ from taichi_unifusion.kernels import images as kernels
 from taichi_unifusion.preprocessing import PreprocessSettings
 
 CAMERA = PinholeCamera(64, 48, 60.0, 62.0, 30.5, 22.0)
-FINE = PinholeCamera(96, 72, 400.0, 410.0, 45.5, 36.0)  # pixels about as fine as a Kinect's: small steps on slanted planes
-UNIT = 1e-6        # float32 of numbers about 1
-DEGREE = 1.0       # of normals from noise-free depth: what float32 depth and its inverse leave, with margin
-NORMAL = 1e-3      # float32 slopes of the inverse depth, differences of numbers 1 % apart
+# pixels about as fine as a Kinect's: small steps on slanted planes
+FINE = PinholeCamera(96, 72, 400.0, 410.0, 45.5, 36.0)
+UNIT = 1e-6  # float32 of numbers about 1
+# of normals from noise-free depth: what float32 depth and its inverse leave, with margin
+DEGREE = 1.0
+NORMAL = 1e-3  # float32 slopes of the inverse depth, differences of numbers 1 % apart
 INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
 
 
 def rays(camera: PinholeCamera = CAMERA) -> np.ndarray:
     """(H, W, 3) directions of unit z."""
-    v, u = np.mgrid[:camera.height, :camera.width]
-    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    return np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
+    )
 
 
 def plane_frame(normal, distance: float = 2.0, camera: PinholeCamera = CAMERA, **values) -> Frame:
     """A frame that sees only the plane through (0, 0, distance) with this normal."""
     depth = np.array([0, 0, distance]) @ normal / (rays(camera) @ normal)
-    return Frame(np.where((depth > 0) & (depth < 20), depth, 0).astype(np.float32), camera, **values)
+    return Frame(
+        np.where((depth > 0) & (depth < 20), depth, 0).astype(np.float32), camera, **values
+    )
 
 
 def tilted(degrees: float, about: float = 0.0) -> np.ndarray:
-    """Unit normal towards the camera, tilted off the optical axis in the direction `about` [degrees]."""
+    """Unit normal towards the camera, tilted off the optical axis in the direction `about`
+    [degrees].
+    """
     tilt, turn = np.radians([degrees, about])
     return np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)])
 
@@ -51,21 +61,36 @@ def step_frame() -> Frame:
 def assert_same_clouds(a: PointCloud, b: PointCloud) -> None:
     """Bit for bit."""
     assert a.points.tobytes() == b.points.tobytes() and a.normals.tobytes() == b.normals.tobytes()
-    assert {k: v.tobytes() for k, v in a.attributes.items()} == {k: v.tobytes() for k, v in b.attributes.items()}
+    assert {k: v.tobytes() for k, v in a.attributes.items()} == {
+        k: v.tobytes() for k, v in b.attributes.items()
+    }
 
 
 # ---- Kernels against their twins ----
+
 
 def test_clip_depth_equals_its_twin():
     rng = np.random.default_rng(1)
     depth = rng.uniform(-1, 8, (20, 30)).astype(np.float32)
     depth[:2] = [[np.nan], [65.535]]
-    depth[2, :8] = np.inf, -np.inf, -0.0, 0.0, 0.1, 5.0, np.nextafter(np.float32(5), np.float32(6)), 1e-30
-    depth[3, :2] = np.array([0x7F800001, 0xFFC00000], np.uint32).view(np.float32)  # a signalling and a negative NaN
+    depth[2, :8] = (
+        np.inf,
+        -np.inf,
+        -0.0,
+        0.0,
+        0.1,
+        5.0,
+        np.nextafter(np.float32(5), np.float32(6)),
+        1e-30,
+    )
+    # a signalling and a negative NaN
+    depth[3, :2] = np.array([0x7F800001, 0xFFC00000], np.uint32).view(np.float32)
     clipped = np.empty_like(depth)
     kernels.clip_depth(depth, 0.1, 5.0, clipped)
     np.testing.assert_array_equal(clipped, reference.clip_depth(depth, 0.1, 5.0))
-    assert clipped[2, 4] == np.float32(0.1) and clipped[2, 5] == 5 and 0.3 < (clipped > 0).mean() < 0.9
+    assert (
+        clipped[2, 4] == np.float32(0.1) and clipped[2, 5] == 5 and 0.3 < (clipped > 0).mean() < 0.9
+    )
 
 
 @pytest.mark.parametrize("support", [0, 3, 5, 8])
@@ -119,7 +144,10 @@ def test_transform_equals_its_twin():
     points, normals = rng.normal(size=(2, 50, 3)).astype(np.float32)
     cloud = PointCloud(points, normals, {"x": points.copy()}).transformed(T)
     np.testing.assert_allclose(cloud.points, reference.transform(points, T), atol=3 * UNIT)
-    np.testing.assert_allclose(cloud.normals, reference.transform(normals, T) - T[:3, 3], atol=3 * UNIT)  # turned, not shifted
+    # turned, not shifted
+    np.testing.assert_allclose(
+        cloud.normals, reference.transform(normals, T) - T[:3, 3], atol=3 * UNIT
+    )
     np.testing.assert_array_equal(cloud.attributes["x"], points)
     with pytest.raises(PoseError):
         cloud.transformed(2 * T)
@@ -127,6 +155,7 @@ def test_transform_equals_its_twin():
 
 
 # ---- Whole frames ----
+
 
 @pytest.mark.parametrize("degrees", [0, 20, 45, 60, 70])
 @pytest.mark.parametrize("about", [0, 130])
@@ -139,7 +168,8 @@ def test_normals_of_planes_are_right_and_point_to_the_camera(degrees, about):
     assert angle.max() < DEGREE
     assert (np.einsum("ni,ni->n", cloud.normals, cloud.points) < 0).all()
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=3 * UNIT)
-    np.testing.assert_allclose(cloud.points @ normal, 2 * normal[2], atol=2e-5)  # the points lie on the plane: float32 at 4 m
+    # the points lie on the plane: float32 at 4 m
+    np.testing.assert_allclose(cloud.points @ normal, 2 * normal[2], atol=2e-5)
 
 
 def test_points_come_row_by_row_from_pixels_with_their_colour_and_images():
@@ -147,7 +177,11 @@ def test_points_come_row_by_row_from_pixels_with_their_colour_and_images():
     v, u = np.mgrid[:48, :64]
     place = (v * 64 + u).astype(np.float32)
     color = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
-    frame = Frame(frame.depth, CAMERA, color).with_image("place", place).with_image("deep", rng.normal(size=(48, 64, 7)))
+    frame = (
+        Frame(frame.depth, CAMERA, color)
+        .with_image("place", place)
+        .with_image("deep", rng.normal(size=(48, 64, 7)))
+    )
     cloud = preprocess(frame)
     pixel = cloud.attributes["place"][:, 0].astype(int)
     assert (np.diff(pixel) > 0).all() and set(cloud.attributes) == {"color", "place", "deep"}
@@ -155,8 +189,12 @@ def test_points_come_row_by_row_from_pixels_with_their_colour_and_images():
     np.testing.assert_allclose(seen[:, 0] * CAMERA.fx + CAMERA.cx, pixel % 64, atol=1e-4)
     np.testing.assert_allclose(seen[:, 1] * CAMERA.fy + CAMERA.cy, pixel // 64, atol=1e-4)
     np.testing.assert_array_equal(cloud.points[:, 2], frame.depth.reshape(-1)[pixel])
-    np.testing.assert_allclose(cloud.attributes["color"], color.reshape(-1, 3)[pixel] / 255, atol=UNIT)
-    np.testing.assert_array_equal(cloud.attributes["deep"], frame.images["deep"].reshape(-1, 7)[pixel])
+    np.testing.assert_allclose(
+        cloud.attributes["color"], color.reshape(-1, 3)[pixel] / 255, atol=UNIT
+    )
+    np.testing.assert_array_equal(
+        cloud.attributes["deep"], frame.images["deep"].reshape(-1, 7)[pixel]
+    )
 
 
 def test_an_image_named_color_replaces_the_colour():
@@ -169,17 +207,24 @@ def test_an_image_named_color_replaces_the_colour():
 def test_F2_F3_invalid_readings_equal_zeros_bit_for_bit(bad):
     frame = step_frame()
     spoilt = np.random.default_rng(5).uniform(size=frame.depth.shape) < 0.2
-    clean, dirty = (preprocess(Frame(np.where(spoilt, np.float32(value), frame.depth), CAMERA, frame.color))
-                    for value in (0, bad))
+    clean, dirty = (
+        preprocess(Frame(np.where(spoilt, np.float32(value), frame.depth), CAMERA, frame.color))
+        for value in (0, bad)
+    )
     assert len(clean) > 100
     assert_same_clouds(dirty, clean)
 
 
 def test_F2_a_mix_of_invalid_readings_equals_zeros_bit_for_bit():
     frame, rng = step_frame(), np.random.default_rng(6)
-    mix = rng.choice(np.array([np.nan, np.inf, -np.inf, -3, 0, 65.535], np.float32), frame.depth.shape)
+    mix = rng.choice(
+        np.array([np.nan, np.inf, -np.inf, -3, 0, 65.535], np.float32), frame.depth.shape
+    )
     spoilt = rng.uniform(size=frame.depth.shape) < 0.3
-    clean, dirty = (preprocess(Frame(np.where(spoilt, value, frame.depth).astype(np.float32), CAMERA)) for value in (0, mix))
+    clean, dirty = (
+        preprocess(Frame(np.where(spoilt, value, frame.depth).astype(np.float32), CAMERA))
+        for value in (0, mix)
+    )
     assert len(clean) > 100
     assert_same_clouds(dirty, clean)
 
@@ -189,7 +234,10 @@ def test_F1_F10_a_frame_without_usable_depth_gives_an_empty_cloud_with_its_attri
     frame = Frame(np.full((48, 64), value, np.float32), CAMERA, np.zeros((48, 64, 3), np.uint8))
     cloud = preprocess(frame.with_image("ir", np.zeros((48, 64))))
     assert len(cloud) == 0 and cloud.normals.shape == (0, 3)
-    assert {name: values.shape for name, values in cloud.attributes.items()} == {"color": (0, 3), "ir": (0, 1)}
+    assert {name: values.shape for name, values in cloud.attributes.items()} == {
+        "color": (0, 3),
+        "ir": (0, 1),
+    }
 
 
 @pytest.mark.parametrize("at", [(20, 30), (0, 0), (47, 63)])
@@ -197,13 +245,16 @@ def test_F4_one_valid_pixel_gives_no_point(at):
     depth = np.zeros((48, 64), np.float32)
     depth[at] = 1
     assert len(preprocess(Frame(depth, CAMERA))) == 0
-    assert len(preprocess(Frame(depth, CAMERA), PreprocessSettings(edge_support=0))) == 0  # no neighbours, no normal
+    # no neighbours, no normal
+    assert len(preprocess(Frame(depth, CAMERA), PreprocessSettings(edge_support=0))) == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (7, 7), (65, 1)])
 def test_images_smaller_than_a_window_give_no_points(size):
     camera = PinholeCamera(*size, 50.0, 50.0, 0.5, 0.5)
-    cloud = preprocess(Frame(np.ones(size[::-1], np.float32), camera), PreprocessSettings(normal_radius=3))
+    cloud = preprocess(
+        Frame(np.ones(size[::-1], np.float32), camera), PreprocessSettings(normal_radius=3)
+    )
     assert len(cloud) <= 4 and np.isfinite(cloud.points).all()
 
 
@@ -219,13 +270,14 @@ def test_depth_range_is_kept_inclusive_and_nothing_else():
 def test_flying_pixels_are_dropped_and_a_slanted_plane_survives():
     depth = np.full((48, 64), 3.0, np.float32)
     depth[:, :30] = 1.0
-    depth[:, 30] = 2.0                      # smeared over the edge
+    depth[:, 30] = 2.0  # smeared over the edge
     cloud = preprocess(Frame(depth, CAMERA))
     z = cloud.points[:, 2]
     assert ((z == 1) | (z == 3)).all() and (z == 1).sum() > 800 and (z == 3).sum() > 1000
     assert (cloud.normals[:, 2] < -0.999).all()  # also beside the edge
     kept = preprocess(Frame(depth, CAMERA), PreprocessSettings(edge_support=2))
-    assert (kept.points[:, 2] == 2).sum() == 0   # without a window on its own surface it has no normal
+    # without a window on its own surface it has no normal
+    assert (kept.points[:, 2] == 2).sum() == 0
     slanted = plane_frame(tilted(65, 20), camera=FINE)
     assert len(preprocess(slanted)) > 0.75 * slanted.depth.size
 
@@ -237,7 +289,11 @@ def test_grazing_pixels_are_left_out(limit):
     everything = preprocess(frame, PreprocessSettings(max_angle=90))
 
     def angles(c):
-        return np.degrees(np.arccos(-np.einsum("ni,ni->n", c.points, c.normals) / np.linalg.norm(c.points, axis=1)))
+        return np.degrees(
+            np.arccos(
+                -np.einsum("ni,ni->n", c.points, c.normals) / np.linalg.norm(c.points, axis=1)
+            )
+        )
 
     assert 0 < len(cloud) < len(everything)
     assert angles(cloud).max() <= limit + 0.01
@@ -246,12 +302,26 @@ def test_grazing_pixels_are_left_out(limit):
 
 def test_strided_images_are_read_as_they_are():
     frame = step_frame()
-    turned = Frame(np.asfortranarray(frame.depth), CAMERA, np.ascontiguousarray(frame.color[..., ::-1])[..., ::-1])
+    turned = Frame(
+        np.asfortranarray(frame.depth),
+        CAMERA,
+        np.ascontiguousarray(frame.color[..., ::-1])[..., ::-1],
+    )
     assert_same_clouds(preprocess(turned), preprocess(frame))
 
 
-@pytest.mark.parametrize("wrong", [dict(depth_min=0.0), dict(depth_min=3.0, depth_max=2.0), dict(edge_jump=0.0),
-                                   dict(edge_support=9), dict(normal_radius=0), dict(max_angle=0.0), dict(max_angle=91.0)])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        dict(depth_min=0.0),
+        dict(depth_min=3.0, depth_max=2.0),
+        dict(edge_jump=0.0),
+        dict(edge_support=9),
+        dict(normal_radius=0),
+        dict(max_angle=0.0),
+        dict(max_angle=91.0),
+    ],
+)
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(InputError, match="preprocess: need "):
         PreprocessSettings(**wrong)

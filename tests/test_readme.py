@@ -20,7 +20,9 @@ def write_seven_scenes(folder: Path, frames: int) -> None:
     for n in range(frames):
         frame = room[n]
         cv2.imwrite(str(folder / f"frame-{n:06d}.color.png"), frame.color[..., ::-1])
-        cv2.imwrite(str(folder / f"frame-{n:06d}.depth.png"), np.round(frame.depth * 1000).astype(np.uint16))
+        cv2.imwrite(
+            str(folder / f"frame-{n:06d}.depth.png"), np.round(frame.depth * 1000).astype(np.uint16)
+        )
         np.savetxt(folder / f"frame-{n:06d}.pose.txt", frame.T_world_camera)
 
 
@@ -30,11 +32,13 @@ def test_snippet_makes_a_colored_mesh(tmp_path, monkeypatch):
     recording.mkdir()
     write_seven_scenes(recording, 11)
     monkeypatch.chdir(tmp_path)
-    exec(compile(snippet, "README.md", "exec"), {"path": recording})  # noqa: S102
+    exec(compile(snippet, "README.md", "exec"), {"path": recording})
     mesh = read_mesh(tmp_path / "kitchen.ply")
     assert len(mesh.faces) > 1000
     color = mesh.attributes["color"]
-    assert color.shape == (len(mesh.vertices), 3) and color.std(axis=0).min() > 0.02, "colours that vary over the room"
+    assert color.shape == (len(mesh.vertices), 3) and color.std(axis=0).min() > 0.02, (
+        "colours that vary over the room"
+    )
 
 
 def test_readme_is_short_and_names_no_missing_file():

@@ -19,7 +19,11 @@ def test_only_an_old_lock_is_taken_from_the_cache_of_kernels(age, stays, tmp_pat
     lock.touch()
     os.utime(lock, (time.time() - age,) * 2)
     code = "import taichi_unifusion as uf; uf.init('cpu', threads=1)"
-    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path)})
+    subprocess.run(
+        [sys.executable, "-c", code],
+        check=True,
+        env=os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path)},
+    )
     assert lock.exists() == stays
 
 

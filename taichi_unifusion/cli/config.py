@@ -16,7 +16,8 @@ from .terminal import DONE
 class ShowConfig:
     """Print every setting, as it would be used, in YAML that --config reads back.
 
-    Settings come from the defaults, then from --config FILE, then from options. A file needs to hold only what differs.
+    Settings come from the defaults, then from --config FILE, then from options. A file needs to
+    hold only what differs.
     """
 
     config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = None

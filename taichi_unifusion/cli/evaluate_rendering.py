@@ -12,9 +12,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..datasets import Dataset, open_dataset
 from ..errors import DatasetError, FrameError, InputError
-from .terminal import format_table, frame_progress
 from .recording import FORMAT_DEFAULT
 from .scores import ScoreOptions, cell, percent
+from .terminal import format_table, frame_progress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,7 +29,8 @@ RUN_DEFAULT, CHOICE_DEFAULT = "(default: the run's recording)", "(default: the r
 
 @dataclass(frozen=True)
 class EvaluateRendering(ScoreOptions):
-    """Compare depth and colour, rendered at the frames' poses, with the frames: depth L1, coverage, PSNR, SSIM.
+    """Compare depth and colour, rendered at the frames' poses, with the frames: depth L1, coverage,
+    PSNR, SSIM.
 
     Example: unifusion evaluate rendering results/kitchen
 
@@ -38,22 +39,33 @@ class EvaluateRendering(ScoreOptions):
     """
 
     reconstruction: Annotated[Positional[Path], arg(metavar="RESULTS|MESH")]
-    """Results folder of `unifusion reconstruct`, or a mesh file, whose vertex colours are judged."""
-    format: Annotated[Positional[str | None], arg(metavar="[FORMAT]", help_behavior_hint=RUN_DEFAULT)] = None
+    """Results folder of `unifusion reconstruct`, or a mesh file, whose vertex colours are judged.
+    """
+    format: Annotated[
+        Positional[str | None], arg(metavar="[FORMAT]", help_behavior_hint=RUN_DEFAULT)
+    ] = None
     """The kind of recording to compare with."""
-    path: Annotated[Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint=RUN_DEFAULT)] = None
+    path: Annotated[
+        Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint=RUN_DEFAULT)
+    ] = None
     """Where it lies."""
     start: Annotated[int | None, arg(metavar="A", help_behavior_hint=CHOICE_DEFAULT)] = None
     """First frame, counted from 0."""
     end: Annotated[int | None, arg(metavar="B", help_behavior_hint=CHOICE_DEFAULT)] = None
     """Frame to stop before."""
-    every: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 1, or see above)")] = None
+    every: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: 1, or see above)")
+    ] = None
     """Compare with every N-th frame."""
     all: FlagCreatePairsOff[bool] = False
     """Let frames in that the run has used; alone: these."""
-    depth_min: Annotated[float | None, arg(metavar="M", help_behavior_hint="(default: the run's, else 0.1)")] = None
+    depth_min: Annotated[
+        float | None, arg(metavar="M", help_behavior_hint="(default: the run's, else 0.1)")
+    ] = None
     """Nearest reading to compare with, in metres."""
-    depth_max: Annotated[float | None, arg(metavar="M", help_behavior_hint="(default: the run's, else 5)")] = None
+    depth_max: Annotated[
+        float | None, arg(metavar="M", help_behavior_hint="(default: the run's, else 5)")
+    ] = None
     """Farthest reading to compare with, in metres."""
     depth_scale: Annotated[float | None, arg(metavar="S", help_behavior_hint=FORMAT_DEFAULT)] = None
     """Units of the depth images that make a metre."""
@@ -70,9 +82,9 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
 
     from .. import runtime
     from ..config import Config
-    from ..files.foreign_meshes import read_any_mesh
     from ..evaluation.rendering import WITHIN
     from ..evaluation.rendering import evaluate_rendering as evaluate
+    from ..files.foreign_meshes import read_any_mesh
     from ..results.reader import find_run
 
     run = find_run(options.reconstruction)
@@ -81,20 +93,58 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     chosen = choose_frames(options, run, len(recording), recording.name)
     limits = run.config().preprocess if run else Config().preprocess
     runtime.init(options.device)
-    color, T_run_recording = _color_map(options, run), np.linalg.inv(run.T_recording_run()) if run else np.eye(4)
+    color, T_run_recording = (
+        _color_map(options, run),
+        np.linalg.inv(run.T_recording_run()) if run else np.eye(4),
+    )
     with frame_progress(len(chosen)) as on_frame:
-        result = evaluate(mesh, _usable(recording, chosen, T_run_recording, on_frame), color=color.query if color else None,
-                          depth_min=limits.depth_min if options.depth_min is None else options.depth_min,
-                          depth_max=limits.depth_max if options.depth_max is None else options.depth_max)
+        result = evaluate(
+            mesh,
+            _usable(recording, chosen, T_run_recording, on_frame),
+            color=color.query if color else None,
+            depth_min=limits.depth_min if options.depth_min is None else options.depth_min,
+            depth_max=limits.depth_max if options.depth_max is None else options.depth_max,
+        )
     used = set(run.used if run else ()) & {score.index for score in result.frames}
-    rows = [["depth L1 cm", "median cm", f"within {100 * WITHIN:g} cm %", "coverage %", "PSNR dB", "SSIM"],
-            [cell(result.depth_l1_cm), cell(result.depth_median_cm), percent(result.depth_within), percent(result.coverage),
-             cell(result.psnr_db), cell(result.ssim, 3)]]
+    rows = [
+        [
+            "depth L1 cm",
+            "median cm",
+            f"within {100 * WITHIN:g} cm %",
+            "coverage %",
+            "PSNR dB",
+            "SSIM",
+        ],
+        [
+            cell(result.depth_l1_cm),
+            cell(result.depth_median_cm),
+            percent(result.depth_within),
+            percent(result.coverage),
+            cell(result.psnr_db),
+            cell(result.ssim, 3),
+        ],
+    ]
     compared = f"Means over {len(result.frames)} frames of {recording.name}, "
-    compared += f"{len(used)} of which the run has used" if used else "none of which the run has used" if run else "from file"
-    about = {"metric": "rendering", "reconstruction": options.reconstruction, "recording": recording.name,
-             "used_by_the_run": sorted(used), "colour": "map" if color else "vertices"}
-    return options.show(about, result, format_table(rows), f"{compared}; colour from the {'map' if color else 'vertices'}.")
+    compared += (
+        f"{len(used)} of which the run has used"
+        if used
+        else "none of which the run has used"
+        if run
+        else "from file"
+    )
+    about = {
+        "metric": "rendering",
+        "reconstruction": options.reconstruction,
+        "recording": recording.name,
+        "used_by_the_run": sorted(used),
+        "colour": "map" if color else "vertices",
+    }
+    return options.show(
+        about,
+        result,
+        format_table(rows),
+        f"{compared}; colour from the {'map' if color else 'vertices'}.",
+    )
 
 
 def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Run | None]:
@@ -102,18 +152,26 @@ def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Ru
     given = {} if options.depth_scale is None else {"depth_scale": options.depth_scale}
     if run is None:
         if options.format is None:
-            raise InputError("rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT "
-                             "PATH")
+            raise InputError(
+                "rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT "
+                "PATH"
+            )
         return open_dataset(options.format, options.path, **given), None
     if options.format is None:
         run = replace(run, reading={**run.reading, **given})
     else:
-        run = replace(run, format=options.format, path=options.path,
-                      reading={**(run.reading if run.format == options.format else {}), **given})
+        run = replace(
+            run,
+            format=options.format,
+            path=options.path,
+            reading={**(run.reading if run.format == options.format else {}), **given},
+        )
     return run.recording(), run
 
 
-def choose_frames(options: EvaluateRendering, run: Run | None, count: int, name: str) -> Sequence[int]:
+def choose_frames(
+    options: EvaluateRendering, run: Run | None, count: int, name: str
+) -> Sequence[int]:
     """The frames to compare with, of `count` in the recording: held-out ones, unless `options.all`."""
     start, end, every = options.start, options.end, options.every
     if run is not None and (start, end, every) == (None, None, None):
@@ -122,19 +180,27 @@ def choose_frames(options: EvaluateRendering, run: Run | None, count: int, name:
     end = run.stop if end is None and run and start < run.stop else end
     every = 1 if every is None else every
     if start < 0 or every < 1 or (end is not None and end <= start):
-        raise InputError(f"frames: need 0 <= start < end and every >= 1, got start {start}, end {end}, every {every}")
+        raise InputError(
+            f"frames: need 0 <= start < end and every >= 1, got start {start}, end {end}, every {every}"
+        )
     asked = range(count)[start:end:every]
     if not asked:
         raise DatasetError(f"{name}: there is no frame {start}, it has {count} (0 is the first)")
     held_out = asked if run is None or options.all else [i for i in asked if i not in set(run.used)]
     if not held_out:
-        raise InputError("rendering: the run has used every one of these frames; reconstruct with --every 2 or more to hold "
-                         "some out, choose others with --start, --end, --every, or compare with used ones by --all")
+        raise InputError(
+            "rendering: the run has used every one of these frames; reconstruct with --every 2 or more to hold "
+            "some out, choose others with --start, --end, --every, or compare with used ones by --all"
+        )
     return held_out
 
 
-def _usable(recording: Dataset, chosen: Sequence[int], T_run_recording: NDArray,
-            on_frame: Callable[[int, int], None]) -> Iterator[Frame]:
+def _usable(
+    recording: Dataset,
+    chosen: Sequence[int],
+    T_run_recording: NDArray,
+    on_frame: Callable[[int, int], None],
+) -> Iterator[Frame]:
     """The frames that can be read and have a pose, in the run's world; the others are said."""
     for done, index in enumerate(chosen, start=1):
         try:

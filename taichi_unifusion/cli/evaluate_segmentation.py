@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
-from .terminal import format_table
 from .scores import ScoreOptions, percent
+from .terminal import format_table
 
 if TYPE_CHECKING:
     from ..files.labels import LabelFile
@@ -22,12 +22,14 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class EvaluateSegmentation(ScoreOptions):
-    """Compare predicted labels of points with true ones: IoU and accuracy of every class, of seen and unseen ones.
+    """Compare predicted labels of points with true ones: IoU and accuracy of every class, of seen
+    and unseen ones.
 
     Example: unifusion evaluate segmentation labelled.ply truth.ply --names classes.txt
 
-    Labels are whole numbers: a vertex property of a .ply, one number a line in a .txt, or an array in a .npy. Between two .ply
-    of different vertices, each true point takes the label of the nearest predicted one.
+    Labels are whole numbers: a vertex property of a .ply, one number a line in a .txt, or an array
+    in a .npy. Between two .ply of different vertices, each true point takes the label of the
+    nearest predicted one.
     """
 
     predicted: Annotated[Positional[Path], arg(metavar="PREDICTED")]
@@ -49,23 +51,53 @@ class EvaluateSegmentation(ScoreOptions):
 def evaluate_segmentation(options: EvaluateSegmentation) -> int:
     """Labels -> table."""
     options.check_out()
-    from ..files.labels import read_class_names, read_labels
     from ..evaluation.segmentation import evaluate_segmentation as evaluate
+    from ..files.labels import read_class_names, read_labels
 
     names = read_class_names(options.names) if options.names else None
-    predicted, truth = (read_labels(path, options.attribute) for path in (options.predicted, options.ground_truth))
-    result = evaluate(_on_true_points(predicted, truth, options.max_distance), truth.labels, names=names, ignore=options.ignore,
-                      unseen=_labels_of(options.unseen, names))
+    predicted, truth = (
+        read_labels(path, options.attribute) for path in (options.predicted, options.ground_truth)
+    )
+    result = evaluate(
+        _on_true_points(predicted, truth, options.max_distance),
+        truth.labels,
+        names=names,
+        ignore=options.ignore,
+        unseen=_labels_of(options.unseen, names),
+    )
     rows = [["class", "IoU %", "accuracy %", "points"]]
-    rows += [[score.name + ("" if score.seen else " *"), percent(score.iou), percent(score.accuracy), str(score.points)]
-             for score in result.classes]
-    means = [["mean over", "IoU %", "accuracy %", "classes"],
-             ["all classes", percent(result.mean_iou), percent(result.mean_accuracy), str(len(result.classes))]]
-    means += [[name, percent(group.mean_iou), percent(group.mean_accuracy), str(group.classes)]
-              for name, group in (("seen classes", result.seen), ("unseen classes *", result.unseen)) if group]
-    notes = (f"{percent(result.overall_accuracy)} % of {result.points:,} points are right; {result.unlabelled:,} of them have "
-             f"no predicted label, {result.ignored:,} more were left out.")
-    about = {"metric": "segmentation", "predicted": options.predicted, "ground_truth": options.ground_truth}
+    rows += [
+        [
+            score.name + ("" if score.seen else " *"),
+            percent(score.iou),
+            percent(score.accuracy),
+            str(score.points),
+        ]
+        for score in result.classes
+    ]
+    means = [
+        ["mean over", "IoU %", "accuracy %", "classes"],
+        [
+            "all classes",
+            percent(result.mean_iou),
+            percent(result.mean_accuracy),
+            str(len(result.classes)),
+        ],
+    ]
+    means += [
+        [name, percent(group.mean_iou), percent(group.mean_accuracy), str(group.classes)]
+        for name, group in (("seen classes", result.seen), ("unseen classes *", result.unseen))
+        if group
+    ]
+    notes = (
+        f"{percent(result.overall_accuracy)} % of {result.points:,} points are right; {result.unlabelled:,} of them have "
+        f"no predicted label, {result.ignored:,} more were left out."
+    )
+    about = {
+        "metric": "segmentation",
+        "predicted": options.predicted,
+        "ground_truth": options.ground_truth,
+    }
     return options.show(about, result, format_table(rows), format_table(means), notes)
 
 
@@ -75,9 +107,16 @@ def _on_true_points(predicted: LabelFile, truth: LabelFile, max_distance: float)
 
     from ..evaluation.segmentation import transfer_labels
 
-    if predicted.points is None or truth.points is None or np.array_equal(predicted.points, truth.points):
+    if (
+        predicted.points is None
+        or truth.points is None
+        or np.array_equal(predicted.points, truth.points)
+    ):
         return predicted.labels
-    logger.info("the vertices differ: labels are carried to the nearest of them, over %g m at most", max_distance)
+    logger.info(
+        "the vertices differ: labels are carried to the nearest of them, over %g m at most",
+        max_distance,
+    )
     return transfer_labels(predicted.points, predicted.labels, truth.points, max_distance)
 
 

@@ -9,13 +9,14 @@ from typing import Annotated, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..errors import InputError
-from .terminal import format_table
 from .scores import ScoreOptions, cell, percent
+from .terminal import format_table
 
 
 @dataclass(frozen=True)
 class EvaluateSurface(ScoreOptions):
-    """Compare a reconstructed surface with the true one: accuracy, completeness, F1, Chamfer distance.
+    """Compare a reconstructed surface with the true one: accuracy, completeness, F1, Chamfer
+    distance.
 
     Example: unifusion evaluate surface results/demo
 
@@ -24,10 +25,17 @@ class EvaluateSurface(ScoreOptions):
 
     reconstruction: Annotated[Positional[Path], arg(metavar="RESULTS|MESH")]
     """Results folder of `unifusion reconstruct`, or a mesh file."""
-    ground_truth: Annotated[Positional[Path | None], arg(
-        metavar="[TRUTH]", help_behavior_hint="(default: the recording's own, where it has one: synthetic, scene)")] = None
+    ground_truth: Annotated[
+        Positional[Path | None],
+        arg(
+            metavar="[TRUTH]",
+            help_behavior_hint="(default: the recording's own, where it has one: synthetic, scene)",
+        ),
+    ] = None
     """The true mesh: a file in the same frame of reference, in metres."""
-    seen_by: Annotated[Path | None, arg(metavar="RESULTS", help_behavior_hint="(default: RESULTS itself)")] = None
+    seen_by: Annotated[
+        Path | None, arg(metavar="RESULTS", help_behavior_hint="(default: RESULTS itself)")
+    ] = None
     """Results folder whose frames decide what is judged."""
     whole: FlagCreatePairsOff[bool] = False
     """Judge everything, seen or not."""
@@ -38,7 +46,9 @@ class EvaluateSurface(ScoreOptions):
     seed: Annotated[int, arg(metavar="N")] = 0
     """Of the drawing."""
     to: Literal["surface", "samples"] = "surface"
-    """Measure to the other mesh's surface, or, as published, to its samples: too coarse where these lie far apart."""
+    """Measure to the other mesh's surface, or, as published, to its samples: too coarse where these
+    lie far apart.
+    """
     device: Literal["auto", "cuda", "cpu"] = "auto"
     """Where to compute."""
 
@@ -49,34 +59,64 @@ def evaluate_surface(options: EvaluateSurface) -> int:
         raise InputError("surface: --whole and --seen-by exclude each other")
     options.check_out()
     from .. import runtime
-    from ..geometry.triangles import transformed
-    from ..files.foreign_meshes import read_any_mesh
-    from ..results.reader import find_run, read_run
     from ..evaluation.surface import evaluate_surface as evaluate
+    from ..files.foreign_meshes import read_any_mesh
+    from ..geometry.triangles import transformed
+    from ..results.reader import find_run, read_run
 
     run = find_run(options.reconstruction)
     judge = run if options.seen_by is None else read_run(options.seen_by)
     if options.ground_truth is None and judge is None:
         raise InputError("surface: give the true mesh too: unifusion evaluate surface MESH TRUTH")
     runtime.init(options.device)
-    mesh = transformed(run.mesh(), run.T_recording_run()) if run else read_any_mesh(options.reconstruction)
+    mesh = (
+        transformed(run.mesh(), run.T_recording_run())
+        if run
+        else read_any_mesh(options.reconstruction)
+    )
     views = judge.views() if judge and not options.whole else None
-    truth = _own_truth(judge) if options.ground_truth is None else read_any_mesh(options.ground_truth)
-    result = evaluate(mesh, truth, views=views, thresholds=options.thresholds, samples=options.samples, seed=options.seed,
-                      distance_to=options.to)
+    truth = (
+        _own_truth(judge) if options.ground_truth is None else read_any_mesh(options.ground_truth)
+    )
+    result = evaluate(
+        mesh,
+        truth,
+        views=views,
+        thresholds=options.thresholds,
+        samples=options.samples,
+        seed=options.seed,
+        distance_to=options.to,
+    )
     shares = [["within cm", "precision %", "recall %", "F1 %"]]
-    shares += [[f"{100 * s.threshold:g}", percent(s.precision), percent(s.recall), percent(s.f1)] for s in result.scores]
-    means = [["mean distance", "cm"], ["reconstruction to truth (accuracy)", cell(result.accuracy_cm)],
-             ["truth to reconstruction (completeness)", cell(result.completeness_cm)],
-             ["mean of both (Chamfer)", cell(result.chamfer_cm)]]
+    shares += [
+        [f"{100 * s.threshold:g}", percent(s.precision), percent(s.recall), percent(s.f1)]
+        for s in result.scores
+    ]
+    means = [
+        ["mean distance", "cm"],
+        ["reconstruction to truth (accuracy)", cell(result.accuracy_cm)],
+        ["truth to reconstruction (completeness)", cell(result.completeness_cm)],
+        ["mean of both (Chamfer)", cell(result.chamfer_cm)],
+    ]
     judged = "Judged is everything, seen or not."
     if views:
-        shares_seen = percent(1 - result.ground_truth_unseen), percent(1 - result.reconstruction_unseen)
-        judged = (f"Judged is what {len(views.T_world_camera)} frames could tell: {shares_seen[0]} % of the true surface, "
-                  f"{shares_seen[1]} % of the reconstruction; --whole judges all.")
-    about = {"metric": "surface", "reconstruction": options.reconstruction,
-             "ground_truth": options.ground_truth or "the recording's", "seen_by": judge.directory if views else None,
-             "distance_to": options.to, "samples": options.samples, "seed": options.seed}
+        shares_seen = (
+            percent(1 - result.ground_truth_unseen),
+            percent(1 - result.reconstruction_unseen),
+        )
+        judged = (
+            f"Judged is what {len(views.T_world_camera)} frames could tell: {shares_seen[0]} % of the true surface, "
+            f"{shares_seen[1]} % of the reconstruction; --whole judges all."
+        )
+    about = {
+        "metric": "surface",
+        "reconstruction": options.reconstruction,
+        "ground_truth": options.ground_truth or "the recording's",
+        "seen_by": judge.directory if views else None,
+        "distance_to": options.to,
+        "samples": options.samples,
+        "seed": options.seed,
+    }
     return options.show(about, result, format_table(shares), format_table(means), judged)
 
 
@@ -84,6 +124,8 @@ def _own_truth(run):
     """The mesh that the recording of a run was rendered from."""
     recording = run.recording()
     if not hasattr(recording, "ground_truth_mesh"):
-        raise InputError(f"surface: a recording of format '{run.format}' holds no true surface; give one: "
-                         "unifusion evaluate surface RESULTS TRUTH")
+        raise InputError(
+            f"surface: a recording of format '{run.format}' holds no true surface; give one: "
+            "unifusion evaluate surface RESULTS TRUTH"
+        )
     return recording.ground_truth_mesh()

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
-from .terminal import format_table
 from .scores import ScoreOptions, cell
+from .terminal import format_table
 
 if TYPE_CHECKING:
     from ..types import Trajectory
@@ -27,8 +27,13 @@ class EvaluateTrajectory(ScoreOptions):
 
     estimate: Annotated[Positional[Path], arg(metavar="RESULTS|FILE")]
     """Results folder of `unifusion reconstruct`, or a file of poses."""
-    ground_truth: Annotated[Positional[Path | None], arg(
-        metavar="[TRUTH]", help_behavior_hint="(default: the poses in the recording that RESULTS was made from)")] = None
+    ground_truth: Annotated[
+        Positional[Path | None],
+        arg(
+            metavar="[TRUTH]",
+            help_behavior_hint="(default: the poses in the recording that RESULTS was made from)",
+        ),
+    ] = None
     """File of true poses."""
     max_difference: Annotated[float, arg(metavar="SECONDS")] = 0.02
     """How far time stamps of an estimated and a true pose may be apart."""
@@ -44,31 +49,52 @@ def evaluate_trajectory(options: EvaluateTrajectory) -> int:
     from ..evaluation.trajectory import evaluate_trajectory as evaluate
 
     estimate, truth = _read(options)
-    result = evaluate(estimate, truth, max_difference=options.max_difference, rpe_delta=options.rpe_delta,
-                      rpe_unit=options.rpe_unit)
-    per = f"{result.rpe_delta:g} {result.rpe_unit if result.rpe_delta != 1 else result.rpe_unit[:-1]}"
+    result = evaluate(
+        estimate,
+        truth,
+        max_difference=options.max_difference,
+        rpe_delta=options.rpe_delta,
+        rpe_unit=options.rpe_unit,
+    )
+    per = (
+        f"{result.rpe_delta:g} {result.rpe_unit if result.rpe_delta != 1 else result.rpe_unit[:-1]}"
+    )
     rows = [["error", "rmse", "mean", "median", "max"]]
-    for name, errors in (("ATE, aligned [cm]", result.ate_cm), ("ATE, aligned and scaled [cm]", result.ate_sim3_cm),
-                         ("ATE, as it is [cm]", result.ate_unaligned_cm),
-                         (f"RPE, translation over {per} [cm]", result.rpe_translation_cm),
-                         (f"RPE, rotation over {per} [deg]", result.rpe_rotation_deg)):
-        rows.append([name, *(cell(getattr(errors, column) if errors else None, 3) for column in rows[0][1:])])
+    for name, errors in (
+        ("ATE, aligned [cm]", result.ate_cm),
+        ("ATE, aligned and scaled [cm]", result.ate_sim3_cm),
+        ("ATE, as it is [cm]", result.ate_unaligned_cm),
+        (f"RPE, translation over {per} [cm]", result.rpe_translation_cm),
+        (f"RPE, rotation over {per} [deg]", result.rpe_rotation_deg),
+    ):
+        rows.append(
+            [
+                name,
+                *(cell(getattr(errors, column) if errors else None, 3) for column in rows[0][1:]),
+            ]
+        )
     notes = f"{result.matches} of {result.estimated_poses} estimated poses were matched with {result.true_poses} true ones."
     if result.scale is not None:
         notes += f" Scale: {result.scale:.4f}."
     if not result.unique:
         notes += "\nThe positions lie on a line or in one point: ATE is right, but the alignment is one of many."
-    about = {"metric": "trajectory", "estimate": options.estimate, "ground_truth": options.ground_truth or "the recording's"}
+    about = {
+        "metric": "trajectory",
+        "estimate": options.estimate,
+        "ground_truth": options.ground_truth or "the recording's",
+    }
     return options.show(about, result, format_table(rows), notes)
 
 
 def _read(options: EvaluateTrajectory) -> tuple[Trajectory, Trajectory]:
-    from ..results.reader import find_run
     from ..files.trajectories import read_trajectory
+    from ..results.reader import find_run
 
     run = find_run(options.estimate)
     if run is None and options.ground_truth is None:
-        raise InputError("trajectory: give the true poses too: unifusion evaluate trajectory FILE TRUTH")
+        raise InputError(
+            "trajectory: give the true poses too: unifusion evaluate trajectory FILE TRUTH"
+        )
     estimate = run.trajectory() if run else read_trajectory(options.estimate)
     if options.ground_truth is None:
         return estimate, run.true_trajectory()

@@ -1,4 +1,6 @@
-"""Ctrl-C and SIGTERM as a request: finish the current piece of work, keep what is done; the second one stops at once."""
+"""Ctrl-C and SIGTERM as a request: finish the current piece of work, keep what is done; the second
+one stops at once.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,19 @@ SHOW_CURSOR = b"\x1b[?25h"  # progress bars hide it
 
 @contextmanager
 def stop_on_signal(clean_up: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Gives a function that says whether a stop was asked for; at a second signal, `clean_up` and the end of the process.
+    """Gives a function that says whether a stop was asked for; at a second signal, `clean_up` and
+    the end of the process.
 
-    The second does not raise KeyboardInterrupt: that may come up in the middle of a clean-up, or where Python ignores it.
+    The second does not raise KeyboardInterrupt: that may come up in the middle of a clean-up, or
+    where Python ignores it.
     """
     requested = threading.Event()
 
     def handle(number: int, stack: object) -> None:
         if not requested.is_set():
             requested.set()
-            os.write(2, STOPPING)  # not through sys.stderr or logging, which may be in the middle of a line
+            # not through sys.stderr or logging, which may be in the middle of a line
+            os.write(2, STOPPING)
             return
         try:
             clean_up()
@@ -35,7 +40,8 @@ def stop_on_signal(clean_up: Callable[[], None]) -> Iterator[Callable[[], bool]]
         finally:
             os._exit(INTERRUPTED)
 
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
+    # only the main thread may set handlers
+    if threading.current_thread() is not threading.main_thread():
         yield requested.is_set
         return
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}

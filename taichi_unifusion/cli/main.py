@@ -1,7 +1,8 @@
 """`unifusion`: finds the subcommand, and is the only place that catches UniFusionError.
 
-Exit codes: 0 done; 2 bad input, or an output that could not be written; 130 stopped by Ctrl-C or SIGTERM; 1 a bug. What needs
-Taichi is imported where it is used, so that `--help` is there at once. UNIFUSION_DEBUG=1 shows tracebacks.
+Exit codes: 0 done; 2 bad input, or an output that could not be written; 130 stopped by Ctrl-C or
+SIGTERM; 1 a bug. What needs Taichi is imported where it is used, so that `--help` is there at once.
+UNIFUSION_DEBUG=1 shows tracebacks.
 """
 
 from __future__ import annotations
@@ -18,26 +19,29 @@ from typing import Annotated, Union
 import tyro
 from tyro.conf import subcommand
 
+from ..config import Config, load_config
+from ..errors import FileError, UniFusionError
 from .config import ShowConfig, show_config
 from .evaluate import METRICS, Evaluate
 from .info import Info, info
+from .interrupts import INTERRUPTED
 from .mesh import ExtractMesh, extract_mesh
 from .query import Query, query
 from .reconstruct import Reconstruct, reconstruct
 from .segment import Segment, segment
+from .terminal import DONE, FAILED, log_to_stderr, report
 from .transfer import Transfer, transfer
 from .understand import Understand, understand
-from ..config import Config, load_config
-from ..errors import FileError, UniFusionError
-from .interrupts import INTERRUPTED
-from .terminal import DONE, FAILED, log_to_stderr, report
 
 logger = logging.getLogger(__name__)
 
-DESCRIPTION = ("RGB-D frames in, a map out: surface, colour, any property.\n\n"
-               "unifusion COMMAND --help: explains a command\n\nunifusion --version: prints the version")
+DESCRIPTION = (
+    "RGB-D frames in, a map out: surface, colour, any property.\n\n"
+    "unifusion COMMAND --help: explains a command\n\nunifusion --version: prints the version"
+)
 
-COMMANDS: dict[str, tuple[type, Callable[..., int] | dict]] = {  # options and function, or a group: its help, its commands
+# options and function, or a group: its help, its commands
+COMMANDS: dict[str, tuple[type, Callable[..., int] | dict]] = {
     "reconstruct": (Reconstruct, reconstruct),
     "transfer": (Transfer, transfer),
     "understand": (Understand, understand),
@@ -52,7 +56,10 @@ COMMANDS: dict[str, tuple[type, Callable[..., int] | dict]] = {  # options and f
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    argv, debug = list(sys.argv[1:] if argv is None else argv), bool(os.environ.get("UNIFUSION_DEBUG"))
+    argv, debug = (
+        list(sys.argv[1:] if argv is None else argv),
+        bool(os.environ.get("UNIFUSION_DEBUG")),
+    )
     with log_to_stderr(debug):
         try:
             code = _dispatch(argv)
@@ -70,7 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             if debug:
                 raise
             return report([error])
-        except OSError as error:  # our own files are FileErrors; this is standard output, on a full disk
+        except (
+            OSError
+        ) as error:  # our own files are FileErrors; this is standard output, on a full disk
             if debug:
                 raise
             return report([FileError(f"output could not be written: {error.strerror or error}")])
@@ -88,8 +97,14 @@ def _dispatch(argv: list[str]) -> int:
 def _run(prog: str, description: str, commands: dict, argv: list[str]) -> int:
     name, arguments = (argv[0], argv[1:]) if argv and argv[0] in commands else (None, argv)
     if name is None:  # help, or no such command: tyro says it
-        every = Union[tuple(Annotated[_short(options), subcommand(name, description=options.__doc__.splitlines()[0])]
-                            for name, (options, _) in commands.items())]
+        every = Union[
+            tuple(
+                Annotated[
+                    _short(options), subcommand(name, description=options.__doc__.splitlines()[0])
+                ]
+                for name, (options, _) in commands.items()
+            )
+        ]
         tyro.cli(every, prog=prog, description=description, args=arguments)
         return FAILED
     options, command = commands[name]
@@ -108,12 +123,23 @@ def _parse(prog: str, options: type, arguments: list[str]):
     finder.add_argument("--config", nargs="?")
     file = finder.parse_known_args(arguments)[0].config
     settings = load_config(file) if file else Config()
-    required = {field.name: tyro.MISSING for field in dataclasses.fields(options)
-                if field.default is field.default_factory is dataclasses.MISSING}
-    return tyro.cli(options, prog=prog, args=arguments, default=options(**required, settings=settings))
+    required = {
+        field.name: tyro.MISSING
+        for field in dataclasses.fields(options)
+        if field.default is field.default_factory is dataclasses.MISSING
+    }
+    return tyro.cli(
+        options, prog=prog, args=arguments, default=options(**required, settings=settings)
+    )
 
 
 def _short(options: type) -> type:
-    """The options that a command's help shows: where a class only adds `settings` to another, that other one's."""
+    """The options that a command's help shows: where a class only adds `settings` to another, that
+    other one's.
+    """
     base = options.__bases__[0]
-    return base if hasattr(base, "__dataclass_fields__") and "settings" in options.__dataclass_fields__ else options
+    return (
+        base
+        if hasattr(base, "__dataclass_fields__") and "settings" in options.__dataclass_fields__
+        else options
+    )

@@ -23,8 +23,13 @@ class ExtractMesh:
     """Cells along the edge of a surface voxel; 8 gives 4 times the triangles of 4."""
     min_area: Annotated[float, arg(metavar="M2")] = MeshSettings.min_area
     """Connected parts of less than this area, in square metres, are left out; 0 keeps all."""
-    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: DIR/mesh.ply and DIR/mesh.glb)")] = None
-    """Where to write it: .ply, .glb or .obj; by default the meshes of single properties are written again too."""
+    out: Annotated[
+        Path | None,
+        arg(metavar="FILE", help_behavior_hint="(default: DIR/mesh.ply and DIR/mesh.glb)"),
+    ] = None
+    """Where to write it: .ply, .glb or .obj; by default the meshes of single properties are written
+    again too.
+    """
     device: Literal["auto", "cuda", "cpu"] = "auto"
     """Where to compute."""
 
@@ -36,10 +41,18 @@ def extract_mesh(options: ExtractMesh) -> int:
 
     files = [options.out] if options.out else [options.dir / "mesh.ply", options.dir / "mesh.glb"]
     if files[0].suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{files[0]}: a mesh is written as {', '.join(MESH_SUFFIXES)}, not as '{files[0].suffix}'")
-    maps = {path.stem: path for path in sorted((options.dir / "maps").glob("*.safetensors")) if path.stem != "features"}
+        raise InputError(
+            f"{files[0]}: a mesh is written as {', '.join(MESH_SUFFIXES)}, not as '{files[0].suffix}'"
+        )
+    maps = {
+        path.stem: path
+        for path in sorted((options.dir / "maps").glob("*.safetensors"))
+        if path.stem != "features"
+    }
     if "surface" not in maps:
-        raise FileError(f"{options.dir}: no maps/surface.safetensors here; give the results folder of `unifusion reconstruct`")
+        raise FileError(
+            f"{options.dir}: no maps/surface.safetensors here; give the results folder of `unifusion reconstruct`"
+        )
     check_writable(files[0].parent)
     from .. import pipeline, runtime
     from ..maps import PropertyMap, SurfaceMap
@@ -48,7 +61,7 @@ def extract_mesh(options: ExtractMesh) -> int:
     surface = SurfaceMap.load(maps.pop("surface"))
     properties = {name: PropertyMap.load(path) for name, path in maps.items()}
     mesh = pipeline.extract_mesh(surface, properties, options.resolution, options.min_area)
-    meshes = {file: mesh for file in files}
+    meshes = dict.fromkeys(files, mesh)
     if not options.out:
         from ..results.writer import property_meshes
 
@@ -57,8 +70,10 @@ def extract_mesh(options: ExtractMesh) -> int:
     for file, shown in meshes.items():
         try:
             write_mesh(file, shown)
-            print(f"{file}: {len(shown.vertices):,} vertices, {len(shown.faces):,} triangles, "
-                  f"{format_bytes(file.stat().st_size)}")
+            print(
+                f"{file}: {len(shown.vertices):,} vertices, {len(shown.faces):,} triangles, "
+                f"{format_bytes(file.stat().st_size)}"
+            )
         except UniFusionError as error:  # the other file may still be written
             failures.append(error)
     return report(failures)

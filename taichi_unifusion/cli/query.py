@@ -24,16 +24,21 @@ class Query(TextOptions):
 
     Example: unifusion query results/flat "sofa" "something to sit on"
 
-    Each text gives query-TEXT.ply, coloured by relevance, query-TEXT.png, and ranked regions in query.json.
+    Each text gives query-TEXT.ply, coloured by relevance, query-TEXT.png, and ranked regions in
+    query.json.
     """
 
     texts: Annotated[Positional[tuple[str, ...]], arg(metavar="TEXT...")]
     """What to look for."""
-    negative: Annotated[UseAppendAction[tuple[str, ...]], arg(
-        metavar="TEXT", help_behavior_hint="(beside common things; give it once for each)")] = field(default=(), kw_only=True)
+    negative: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="TEXT", help_behavior_hint="(beside common things; give it once for each)"),
+    ] = field(default=(), kw_only=True)
     """What else may be there: a text is found where it beats all of these."""
     threshold: Annotated[float, arg(metavar="R")] = field(default=0.5, kw_only=True)
-    """Relevance, 0..1, that makes a region; 0.5 is a draw with the strongest of what else may be there."""
+    """Relevance, 0..1, that makes a region; 0.5 is a draw with the strongest of what else may be
+    there.
+    """
     min_area: Annotated[float, arg(metavar="M2")] = field(default=0.01, kw_only=True)
     """Regions of less than this area, in square metres, are left out."""
     top: Annotated[int, arg(metavar="N")] = field(default=10, kw_only=True)
@@ -45,7 +50,9 @@ def query(options: Query) -> int:
     from ..errors import InputError
 
     if not options.texts:
-        raise InputError("query: say what to look for, for example: unifusion query results/flat \"sofa\"")
+        raise InputError(
+            'query: say what to look for, for example: unifusion query results/flat "sofa"'
+        )
     from ..files.atomic import check_writable, write_text
     from ..language.questions import ask
     from ..results.writer import ResultsFolder
@@ -53,8 +60,16 @@ def query(options: Query) -> int:
     understood = read_understood(options.dir, options.device)
     folder = ResultsFolder(check_writable(options.dir))
     encoder = options.encoder(understood.features.settings.source)
-    answers = ask(understood.features, understood.mesh, encoder, options.texts, negatives=options.negative,
-                  threshold=options.threshold, min_area=options.min_area, templates=options.templates)
+    answers = ask(
+        understood.features,
+        understood.mesh,
+        encoder,
+        options.texts,
+        negatives=options.negative,
+        threshold=options.threshold,
+        min_area=options.min_area,
+        templates=options.templates,
+    )
     from ..files.meshes import write_mesh
     from ..language.pictures import cameras_that_see, heat_mesh
     from ..rendering.preview import render_preview
@@ -63,9 +78,18 @@ def query(options: Query) -> int:
     for answer in answers:
         mesh, name = heat_mesh(understood.mesh, answer.relevance), f"query-{file_name(answer.text)}"
         folder.write(f"{name}.ply", lambda path, mesh=mesh: write_mesh(path, mesh))
-        cameras = cameras_that_see(understood.trajectory, answer.regions[0].centroid) if answer.found else understood.trajectory
-        folder.write(f"{name}.png", lambda path, mesh=mesh, cameras=cameras: render_preview(mesh, path, trajectory=cameras))
-        listed.append({"mesh": f"{name}.ply", "picture": f"{name}.png", **describe(answer, options.top)})
+        cameras = (
+            cameras_that_see(understood.trajectory, answer.regions[0].centroid)
+            if answer.found
+            else understood.trajectory
+        )
+        folder.write(
+            f"{name}.png",
+            lambda path, mesh=mesh, cameras=cameras: render_preview(mesh, path, trajectory=cameras),
+        )
+        listed.append(
+            {"mesh": f"{name}.ply", "picture": f"{name}.png", **describe(answer, options.top)}
+        )
     text = json.dumps(listed, indent=2)
     folder.write("query.json", lambda path: write_text(path, text + "\n"))
     print(text if options.json else "\n\n".join(_table(entry) for entry in listed))
@@ -75,11 +99,18 @@ def query(options: Query) -> int:
 def describe(answer: Answer, top: int) -> dict[str, Any]:
     """An answer as JSON values."""
     return {
-        "text": answer.text, "found": answer.found, "highest_relevance": round(float(answer.relevance.max(initial=0)), 4),
-        "regions": [{"score": round(region.score, 4), "area_m2": round(region.area, 4),
-                     "centroid": [round(x, 3) for x in region.centroid.tolist()],
-                     "box": [[round(x, 3) for x in corner] for corner in region.box.tolist()]}
-                    for region in answer.regions[:top]],
+        "text": answer.text,
+        "found": answer.found,
+        "highest_relevance": round(float(answer.relevance.max(initial=0)), 4),
+        "regions": [
+            {
+                "score": round(region.score, 4),
+                "area_m2": round(region.area, 4),
+                "centroid": [round(x, 3) for x in region.centroid.tolist()],
+                "box": [[round(x, 3) for x in corner] for corner in region.box.tolist()],
+            }
+            for region in answer.regions[:top]
+        ],
         "regions_in_all": len(answer.regions),
     }
 
@@ -92,14 +123,24 @@ def file_name(text: str) -> str:
 
 def _table(entry: dict[str, Any]) -> str:
     if not entry["found"]:
-        return (f"{entry['text']}: not here; its relevance is {entry['highest_relevance']:.2f} at most, and something else is "
-                "nearer everywhere")
+        return (
+            f"{entry['text']}: not here; its relevance is {entry['highest_relevance']:.2f} at most, and something else is "
+            "nearer everywhere"
+        )
     rows = [["rank", "score", "area m2", "centre x y z m", "size m"]]
     for i, region in enumerate(entry["regions"], start=1):
         low, high = region["box"]
-        rows.append([str(i), f"{region['score']:.2f}", f"{region['area_m2']:.2f}",
-                     " ".join(f"{x:.2f}" for x in region["centroid"]),
-                     " x ".join(f"{b - a:.2f}" for a, b in zip(low, high, strict=True))])
+        rows.append(
+            [
+                str(i),
+                f"{region['score']:.2f}",
+                f"{region['area_m2']:.2f}",
+                " ".join(f"{x:.2f}" for x in region["centroid"]),
+                " x ".join(f"{b - a:.2f}" for a, b in zip(low, high, strict=True)),
+            ]
+        )
     more = entry["regions_in_all"] - len(entry["regions"])
-    return (f"{entry['text']}: {entry['regions_in_all']} region{'s' * (entry['regions_in_all'] != 1)}, {entry['mesh']}, "
-            f"{entry['picture']}\n{format_table(rows)}" + (f"\nand {more} more" if more else ""))
+    return (
+        f"{entry['text']}: {entry['regions_in_all']} region{'s' * (entry['regions_in_all'] != 1)}, {entry['mesh']}, "
+        f"{entry['picture']}\n{format_table(rows)}" + (f"\nand {more} more" if more else "")
+    )

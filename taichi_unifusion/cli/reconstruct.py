@@ -14,8 +14,8 @@ from tyro.conf import FlagCreatePairsOff, arg
 from ..config import Config
 from ..datasets import Dataset
 from .interrupts import INTERRUPTED, stop_on_signal
-from .terminal import frame_progress, report, summarize
 from .recording import RecordingOptions
+from .terminal import frame_progress, report, summarize
 from .tracking import TrackingOptions
 
 if TYPE_CHECKING:
@@ -30,7 +30,8 @@ class ReconstructOptions(TrackingOptions, RecordingOptions):
 
     Example: unifusion reconstruct 7scenes my/redkitchen --every 10 --out results/kitchen
 
-    Without camera poses: unifusion reconstruct folder my_recording --tracking rgbd --out results/mine
+    Without camera poses: unifusion reconstruct folder my_recording --tracking rgbd --out
+    results/mine
 
     Settings that `unifusion config --help` explains are options here too,
 
@@ -39,7 +40,9 @@ class ReconstructOptions(TrackingOptions, RecordingOptions):
 
     out: Annotated[Path, arg(metavar="DIR")] = field(kw_only=True)
     """Folder for the results; made where it does not exist."""
-    config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(default=None, kw_only=True)
+    config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(
+        default=None, kw_only=True
+    )
     """YAML file of settings that differ from the defaults; options given here count more."""
     json: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
     """Print the metrics as JSON instead of tables."""
@@ -63,8 +66,13 @@ def reconstruct(options: Reconstruct, encoder: ImageEncoder | None = None) -> in
         return _run_and_write(options, frames, directory, stop, encoder)
 
 
-def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop: Callable[[], bool],
-                   encoder: ImageEncoder | None) -> int:
+def _run_and_write(
+    options: Reconstruct,
+    frames: Dataset,
+    directory: Path,
+    stop: Callable[[], bool],
+    encoder: ImageEncoder | None,
+) -> int:
     from ..pipeline import Pipeline
     from ..results.writer import TRACKING_FILES, write_results
 
@@ -76,14 +84,26 @@ def _run_and_write(options: Reconstruct, frames: Dataset, directory: Path, stop:
     with frame_progress(len(frames)) as on_frame:
         run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
     if not run.steps:
-        logger.warning("stopped before the first frame was done; %s",
-                       f"{' and '.join(written)} hold the poses found until then" if written else "nothing was written")
+        logger.warning(
+            "stopped before the first frame was done; %s",
+            f"{' and '.join(written)} hold the poses found until then"
+            if written
+            else "nothing was written",
+        )
         return INTERRUPTED
     done = len(run.steps) + len(run.skipped)
     if done < len(frames):
-        logger.warning("%s after %d of %d frames; writing what they gave", "stopped" if run.interrupted else "ended early",
-                       done, len(frames))
+        logger.warning(
+            "%s after %d of %d frames; writing what they gave",
+            "stopped" if run.interrupted else "ended early",
+            done,
+            len(frames),
+        )
     results = write_results(directory, pipeline, run, about, written)
-    print(json.dumps(results.metrics, indent=2) if options.json else summarize(results.metrics, results.files, directory))
+    print(
+        json.dumps(results.metrics, indent=2)
+        if options.json
+        else summarize(results.metrics, results.files, directory)
+    )
     code = report([error for error in (run.failure, *results.failures) if error])
     return INTERRUPTED if stop() else code

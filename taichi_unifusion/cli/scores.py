@@ -1,4 +1,6 @@
-"""What every `unifusion evaluate` command does with its numbers: a table, or JSON on screen and in a file."""
+"""What every `unifusion evaluate` command does with its numbers: a table, or JSON on screen and in
+a file.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ class ScoreOptions:
 
     json: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
     """Print the numbers as JSON instead of a table."""
-    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(default=None, kw_only=True)
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(
+        default=None, kw_only=True
+    )
     """Write the numbers there too, as JSON."""
 
     def check_out(self) -> None:
@@ -32,7 +36,9 @@ class ScoreOptions:
             check_writable(self.out.parent)
 
     def show(self, about: Mapping[str, Any], result: Any, *blocks: str) -> int:
-        """Print blocks of text with an empty line between them, or JSON, and write the file; returns the exit code."""
+        """Print blocks of text with an empty line between them, or JSON, and write the file;
+        returns the exit code.
+        """
         text = json.dumps(_plain({**about, **dataclasses.asdict(result)}), indent=2)
         if self.out:
             from ..files.atomic import atomic_write

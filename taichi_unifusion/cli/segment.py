@@ -1,4 +1,6 @@
-"""`unifusion segment`: a list of names -> the best of them everywhere, as a coloured mesh with a legend."""
+"""`unifusion segment`: a list of names -> the best of them everywhere, as a coloured mesh with a
+legend.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +23,22 @@ class Segment(TextOptions):
 
     Example: unifusion segment results/flat --labels names.txt
 
-    Gives segmentation.ply (with the row of the name as `label`), segmentation.png with a legend, and segmentation.json.
+    Gives segmentation.ply (with the row of the name as `label`), segmentation.png with a legend,
+    and segmentation.json.
 
     With --truth, `unifusion evaluate segmentation` measures the same.
     """
 
     labels: Annotated[Path, arg(metavar="FILE")] = field(kw_only=True)
-    """Names, one a line; a line may begin with a number, which then is the label, as in '3 kitchen table'."""
-    truth: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(default=None, kw_only=True)
-    """Points with true labels, a PLY file with a property `label`: IoU and accuracy are measured there."""
+    """Names, one a line; a line may begin with a number, which then is the label, as in '3 kitchen
+    table'.
+    """
+    truth: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(
+        default=None, kw_only=True
+    )
+    """Points with true labels, a PLY file with a property `label`: IoU and accuracy are measured
+    there.
+    """
 
 
 def segment(options: Segment) -> int:
@@ -46,13 +55,22 @@ def segment(options: Segment) -> int:
     understood = read_understood(options.dir, options.device)
     folder = ResultsFolder(check_writable(options.dir))
     encoder = options.encoder(understood.features.settings.source)
-    found = segment_points(understood.features, understood.mesh.vertices, encoder, tuple(names.values()),
-                           templates=options.templates)
+    found = segment_points(
+        understood.features,
+        understood.mesh.vertices,
+        encoder,
+        tuple(names.values()),
+        templates=options.templates,
+    )
     colors = label_colors(len(names))
     mesh = label_mesh(understood.mesh, found, tuple(names), colors)
     folder.write("segmentation.ply", lambda path: write_mesh(path, mesh))
-    folder.write("segmentation.png", lambda path: write_png(path, segmentation_picture(mesh, found, colors,
-                                                                                       understood.trajectory)))
+    folder.write(
+        "segmentation.png",
+        lambda path: write_png(
+            path, segmentation_picture(mesh, found, colors, understood.trajectory)
+        ),
+    )
     summary: dict[str, Any] = {"labels": _shares(names, found, colors)}
     if truth is not None:
         summary["scores"] = _scores(understood.features, encoder, names, truth, options.templates)
@@ -63,7 +81,9 @@ def segment(options: Segment) -> int:
 
 
 def read_labels_file(path: Path) -> dict[int, str]:
-    """Label -> name of a file of names; raises FileError where it holds none, InputError for a name or number given twice."""
+    """Label -> name of a file of names; raises FileError where it holds none, InputError for a name
+    or number given twice.
+    """
     from ..errors import FileError
     from ..files.atomic import read_bytes
 
@@ -73,7 +93,9 @@ def read_labels_file(path: Path) -> dict[int, str]:
         raise FileError(f"{path}: not a text file") from None
     lines = [" ".join(line.split()) for line in lines]
     lines = [line for line in lines if line and not line.startswith("#")]
-    numbered = [line.partition(" ") for line in lines if line.split(" ")[0].isdecimal() and " " in line]
+    numbered = [
+        line.partition(" ") for line in lines if line.split(" ")[0].isdecimal() and " " in line
+    ]
     if len(numbered) == len(lines):
         names = [(int(number), name) for number, _, name in numbered]
     else:
@@ -90,18 +112,29 @@ def _read_truth(path: Path) -> Any:
 
     mesh = read_mesh(path)
     if "label" not in mesh.attributes:
-        raise InputError(f"{path}: has no vertex property 'label', only {', '.join(mesh.attributes) or 'positions'}")
+        raise InputError(
+            f"{path}: has no vertex property 'label', only {', '.join(mesh.attributes) or 'positions'}"
+        )
     return mesh
 
 
 def _shares(names: Mapping[int, str], found: Any, colors: Any) -> list[dict[str, Any]]:
     """Label, name, colour and share of the vertices of every name."""
     total = max(len(found.labels), 1)
-    return [{"label": label, "name": name, "color": (255 * colors[i] + 0.5).astype(int).tolist(),
-             "share": round(float((found.labels == i).sum() / total), 4)} for i, (label, name) in enumerate(names.items())]
+    return [
+        {
+            "label": label,
+            "name": name,
+            "color": (255 * colors[i] + 0.5).astype(int).tolist(),
+            "share": round(float((found.labels == i).sum() / total), 4),
+        }
+        for i, (label, name) in enumerate(names.items())
+    ]
 
 
-def _scores(features: Any, encoder: Any, names: Mapping[int, str], truth: Any, templates: Any) -> dict[str, Any]:
+def _scores(
+    features: Any, encoder: Any, names: Mapping[int, str], truth: Any, templates: Any
+) -> dict[str, Any]:
     """IoU and accuracy at the true points."""
     import numpy as np
 
@@ -109,25 +142,53 @@ def _scores(features: Any, encoder: Any, names: Mapping[int, str], truth: Any, t
     from ..language.questions import UNLABELLED
     from ..language.questions import segment as segment_points
 
-    found = segment_points(features, truth.vertices, encoder, tuple(names.values()), templates=templates)
+    found = segment_points(
+        features, truth.vertices, encoder, tuple(names.values()), templates=templates
+    )
     predicted = np.where(found.labels >= 0, np.array(list(names))[found.labels], UNLABELLED)
     result = evaluate_segmentation(predicted, truth.attributes["label"][:, 0], names=names)
-    return {"points": result.points, "mean_iou": result.mean_iou, "mean_accuracy": result.mean_accuracy,
-            "overall_accuracy": result.overall_accuracy,
-            "classes": [{"name": score.name, "iou": score.iou, "accuracy": score.accuracy, "points": score.points}
-                        for score in result.classes]}
+    return {
+        "points": result.points,
+        "mean_iou": result.mean_iou,
+        "mean_accuracy": result.mean_accuracy,
+        "overall_accuracy": result.overall_accuracy,
+        "classes": [
+            {
+                "name": score.name,
+                "iou": score.iou,
+                "accuracy": score.accuracy,
+                "points": score.points,
+            }
+            for score in result.classes
+        ],
+    }
 
 
 def _tables(summary: dict[str, Any], files: list[str]) -> str:
     rows = [["label", "name", "share %"]]
-    rows += [[str(entry["label"]), entry["name"], f"{100 * entry['share']:.1f}"]
-             for entry in sorted(summary["labels"], key=lambda entry: -entry["share"]) if entry["share"] > 0]
+    rows += [
+        [str(entry["label"]), entry["name"], f"{100 * entry['share']:.1f}"]
+        for entry in sorted(summary["labels"], key=lambda entry: -entry["share"])
+        if entry["share"] > 0
+    ]
     text = format_table(rows)
     if "scores" in summary:
         scores = summary["scores"]
         rows = [["class", "IoU %", "accuracy %", "points"]]
-        mean = {"name": "mean", "iou": scores["mean_iou"], "accuracy": scores["mean_accuracy"], "points": scores["points"]}
-        rows += [[each["name"], f"{100 * each['iou']:.1f}", f"{100 * each['accuracy']:.1f}", f"{each['points']:,}"]
-                 for each in (*scores["classes"], mean)]
+        mean = {
+            "name": "mean",
+            "iou": scores["mean_iou"],
+            "accuracy": scores["mean_accuracy"],
+            "points": scores["points"],
+        }
+        rows += [
+            [
+                each["name"],
+                f"{100 * each['iou']:.1f}",
+                f"{100 * each['accuracy']:.1f}",
+                f"{each['points']:,}",
+            ]
+            for each in (*scores["classes"], mean)
+        ]
         text += f"\n\n{format_table(rows)}\n{100 * scores['overall_accuracy']:.1f} % of the points are right"
     return f"{text}\n\n{', '.join(files)}"

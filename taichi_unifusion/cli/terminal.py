@@ -1,4 +1,6 @@
-"""What a person sees of a command: messages, a progress bar where stderr is a screen, and tables in plain text."""
+"""What a person sees of a command: messages, a progress bar where stderr is a screen, and tables in
+plain text.
+"""
 
 from __future__ import annotations
 
@@ -57,15 +59,31 @@ def report(errors: Sequence[Exception]) -> int:
 
 @contextmanager
 def frame_progress(total: int) -> Iterator[Callable[[int, int], None]]:
-    """Gives a function to call with (frames done, frames in all): a bar with rate and time left, or now and then a line."""
+    """Gives a function to call with (frames done, frames in all): a bar with rate and time left, or
+    now and then a line.
+    """
     if not sys.stderr.isatty():
         yield _progress_lines()
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        SpinnerColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = (SpinnerColumn(), TextColumn("frames"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
-               TimeRemainingColumn(), TextColumn("left"))
+    columns = (
+        SpinnerColumn(),
+        TextColumn("frames"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
     with Progress(*columns, console=Console(stderr=True)) as bar, _above(bar):
         task = bar.add_task("frames", total=total, rate="")
 
@@ -81,7 +99,9 @@ def _above(bar: Any) -> Iterator[None]:
     """Let the log write above a rich bar."""
     handlers = [handler for handler in logger.handlers if isinstance(handler, StderrHandler)]
     for handler in handlers:
-        handler.write_above_bar = lambda text: bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        handler.write_above_bar = lambda text: bar.console.print(
+            text, markup=False, highlight=False, soft_wrap=True
+        )
     try:
         yield
     finally:
@@ -99,7 +119,11 @@ def _progress_lines() -> Callable[[int, int], None]:
         if now - last < LINE_INTERVAL and done < total:
             return
         last, rate = now, (done - first[1]) / (now - first[0]) if now > first[0] else 0.0
-        left = f", {rate:.1f} frames/s, {(total - done) / rate:.0f} s left" if rate and done < total else ""
+        left = (
+            f", {rate:.1f} frames/s, {(total - done) / rate:.0f} s left"
+            if rate and done < total
+            else ""
+        )
         logger.info("frame %d of %d%s", done, total, left)
 
     return update
@@ -109,8 +133,13 @@ def format_table(rows: Sequence[Sequence[str]]) -> str:
     """Rows of cells as aligned columns; cells that are numbers go to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     numeric = [all(cell[:1].isdigit() for cell in column[1:]) for column in zip(*rows, strict=True)]
-    return "\n".join("  ".join(cell.rjust(width) if right else cell.ljust(width)
-                               for cell, width, right in zip(row, widths, numeric, strict=True)).rstrip() for row in rows)
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(row, widths, numeric, strict=True)
+        ).rstrip()
+        for row in rows
+    )
 
 
 def format_bytes(count: float) -> str:
@@ -128,25 +157,44 @@ def _tracking_lines(tracking: Mapping[str, Any] | None) -> list[str]:
         return []
     counts = ", ".join(f"{count} {verdict}" for verdict, count in tracking["verdicts"].items())
     found = [f"{tracking[name]} {name}" for name in ("keyframes", "loops") if name in tracking]
-    return [f"tracking {tracking['mode']}: {counts}{'; ' if found else ''}{', '.join(found)} ({tracking['seconds']:.1f} s)"]
+    return [
+        f"tracking {tracking['mode']}: {counts}{'; ' if found else ''}{', '.join(found)} ({tracking['seconds']:.1f} s)"
+    ]
 
 
 def summarize(metrics: Mapping[str, Any], files: Sequence[str], directory: Path) -> str:
     """The end of a run in some lines: its metrics, and the files that it wrote."""
     frames, seconds, mesh = metrics["frames"], metrics["seconds"], metrics["mesh"]
     stages = [["stage", "median ms", "mean ms"]]
-    stages += [[stage, f"{value['median']:.1f}", f"{value['mean']:.1f}"] for stage, value in metrics["milliseconds"].items()]
+    stages += [
+        [stage, f"{value['median']:.1f}", f"{value['mean']:.1f}"]
+        for stage, value in metrics["milliseconds"].items()
+    ]
     maps = [["map", "voxels", "voxel size", "memory"]]
-    maps += [[name, f"{value['voxels']:,}", f"{100 * value['voxel_size']:g} cm", format_bytes(value["bytes"])]
-             for name, value in metrics["maps"].items()]
+    maps += [
+        [
+            name,
+            f"{value['voxels']:,}",
+            f"{100 * value['voxel_size']:g} cm",
+            format_bytes(value["bytes"]),
+        ]
+        for name, value in metrics["maps"].items()
+    ]
     lines = _tracking_lines(metrics.get("tracking"))
-    lines += [f"frames   {frames['used']} used, {frames['skipped']} skipped{', stopped early' if frames['interrupted'] else ''}"]
-    lines += [f"           {entry['frames']} {entry['reason']} (first: {entry['first']})" for entry in frames["reasons"]]
+    lines += [
+        f"frames   {frames['used']} used, {frames['skipped']} skipped{', stopped early' if frames['interrupted'] else ''}"
+    ]
+    lines += [
+        f"           {entry['frames']} {entry['reason']} (first: {entry['first']})"
+        for entry in frames["reasons"]
+    ]
     lines += ["", format_table(stages), "", format_table(maps), ""]
     if mesh:
         lines.append(f"mesh     {mesh['vertices']:,} vertices, {mesh['triangles']:,} triangles")
-    lines += [f"time     {seconds['frames']:.1f} s for the frames, {seconds['mesh']:.1f} s for the mesh, "
-              f"{seconds['write']:.1f} s to write",
-              f"memory   {format_bytes(metrics['peak_memory_bytes'])} at most, on {metrics['device_name']}",
-              f"results  {directory}: {', '.join(files)}"]
+    lines += [
+        f"time     {seconds['frames']:.1f} s for the frames, {seconds['mesh']:.1f} s for the mesh, "
+        f"{seconds['write']:.1f} s to write",
+        f"memory   {format_bytes(metrics['peak_memory_bytes'])} at most, on {metrics['device_name']}",
+        f"results  {directory}: {', '.join(files)}",
+    ]
     return "\n".join(lines)

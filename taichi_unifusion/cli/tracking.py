@@ -13,8 +13,8 @@ from tyro.conf import FlagCreatePairsOff, arg
 from ..config import Config
 from ..datasets import Dataset
 from ..errors import DatasetError
-from .terminal import frame_progress
 from .recording import RecordingOptions
+from .terminal import frame_progress
 
 logger = logging.getLogger(__name__)
 
@@ -23,10 +23,14 @@ logger = logging.getLogger(__name__)
 class TrackingOptions:
     """Where camera poses come from."""
 
-    tracking: Literal["given", "external", "internal", "rgbd"] = field(default="given", kw_only=True)
-    """Camera poses. given: the recording's; external: from --trajectory; internal: either of them, refined; rgbd: from the
-    frames alone."""
-    trajectory: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(default=None, kw_only=True)
+    tracking: Literal["given", "external", "internal", "rgbd"] = field(
+        default="given", kw_only=True
+    )
+    """Camera poses. given: the recording's; external: from --trajectory; internal: either of them,
+    refined; rgbd: from the frames alone."""
+    trajectory: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = (
+        field(default=None, kw_only=True)
+    )
     """Poses of another program: TUM, KITTI or Replica file, or a folder of one matrix a frame."""
     interpolate: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
     """Fill gaps of up to a second between the poses of --trajectory."""
@@ -39,15 +43,23 @@ class TrackingOptions:
     def check_poses(self, frames: Dataset) -> None:
         """Say at once that a recording has no poses where they are needed."""
         if frames.no_poses and self.trajectory is None and self.tracking in ("given", "internal"):
-            raise DatasetError(f"{frames.no_poses}, so the frames have no poses; find them from the frames alone with "
-                               "--tracking rgbd, or take another program's with --tracking external --trajectory FILE")
+            raise DatasetError(
+                f"{frames.no_poses}, so the frames have no poses; find them from the frames alone with "
+                "--tracking rgbd, or take another program's with --tracking external --trajectory FILE"
+            )
 
-    def track(self, recording: RecordingOptions, settings: Config, directory: Path,
-              stop: Callable[[], bool]) -> tuple[Dataset, dict[str, object]]:
+    def track(
+        self,
+        recording: RecordingOptions,
+        settings: Config,
+        directory: Path,
+        stop: Callable[[], bool],
+    ) -> tuple[Dataset, dict[str, object]]:
         """The frames that are asked for with their poses, and what to say of them in the metrics.
 
-        All frames between the first and the last are tracked, whatever `--every` leaves for the map: small steps are easier.
-        Poses are written to tracking.csv and tracking.txt at once, so that they outlive whatever comes after.
+        All frames between the first and the last are tracked, whatever `--every` leaves for the
+        map: small steps are easier. Poses are written to tracking.csv and tracking.txt at once, so
+        that they outlive whatever comes after.
         """
         from .. import runtime
         from ..files.trajectories import write_trajectory
@@ -56,8 +68,14 @@ class TrackingOptions:
         from ..tracking.sequence import PosedFrames, track_sequence, write_tracking
 
         frames = replace(recording, every=1).frames()
-        tracker = make_tracker(self.tracking, settings.tracking, settings.preprocess, trajectory=self.trajectory,
-                               interpolate=self.interpolate, max_difference=recording.max_difference)
+        tracker = make_tracker(
+            self.tracking,
+            settings.tracking,
+            settings.preprocess,
+            trajectory=self.trajectory,
+            interpolate=self.interpolate,
+            max_difference=recording.max_difference,
+        )
         runtime.init(settings.device, threads=settings.threads or None)
         logger.info("tracking: %s", self.tracking)
         with frame_progress(len(frames)) as on_frame:
@@ -65,4 +83,7 @@ class TrackingOptions:
         verdicts, poses = TRACKING_FILES
         write_tracking(directory / verdicts, result)
         write_trajectory(directory / poses, result.trajectory)
-        return PosedFrames(frames, result)[::recording.every], {"mode": self.tracking, **result.details}
+        return PosedFrames(frames, result)[:: recording.every], {
+            "mode": self.tracking,
+            **result.details,
+        }

@@ -14,17 +14,24 @@ from .reconstruct import Reconstruct, ReconstructOptions, reconstruct
 
 @dataclass(frozen=True)
 class UnderstandOptions(ReconstructOptions):
-    """Map image-text features (CLIP and its kin) onto the surface, beside its colour, in one pass; then ask with `query`.
+    """Map image-text features (CLIP and its kin) onto the surface, beside its colour, in one pass;
+    then ask with `query`.
 
-    Example: unifusion understand 7scenes my/redkitchen --every 10 --features clip:models/clip-vit-b16 --out results/kitchen
+    Example: unifusion understand 7scenes my/redkitchen --every 10 --features
+    clip:models/clip-vit-b16 --out results/kitchen
 
-    Settings that `unifusion config --help` explains are options here too, for example --feature-map.voxel-size 0.05.
+    Settings that `unifusion config --help` explains are options here too, for example
+    --feature-map.voxel-size 0.05.
     """
 
     features: Annotated[str, arg(metavar="ENCODER")] = field(kw_only=True)
-    """What makes features: clip:MODEL (a folder, or a name with --download), onnx:FILE.onnx, or folder:PATH of saved ones."""
+    """What makes features: clip:MODEL (a folder, or a name with --download), onnx:FILE.onnx, or
+    folder:PATH of saved ones.
+    """
     method: Literal["dense", "crops"] = field(default="dense", kw_only=True)
-    """clip: features of every patch in one go, or of overlapping windows at several scales (slow, coarse)."""
+    """clip: features of every patch in one go, or of overlapping windows at several scales (slow,
+    coarse).
+    """
     short_side: Annotated[int, arg(metavar="PIXELS")] = field(default=336, kw_only=True)
     """clip, dense: shorter side of the image that the network sees."""
     patch: Annotated[int, arg(metavar="PIXELS")] = field(default=16, kw_only=True)
@@ -32,7 +39,9 @@ class UnderstandOptions(ReconstructOptions):
     layout: Literal["auto", "hwc", "chw"] = field(default="auto", kw_only=True)
     """folder: order of height, width and channels in the files."""
     download: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
-    """Allow a CLIP model to be fetched from the Hugging Face hub; without it only what lies on this machine is used."""
+    """Allow a CLIP model to be fetched from the Hugging Face hub; without it only what lies on this
+    machine is used.
+    """
 
 
 @dataclass(frozen=True)
@@ -48,10 +57,18 @@ def understand(options: Understand) -> int:
     from ..language import make_image_encoder
 
     device = options.settings.device
-    choices = {"clip": {"method": options.method, "short_side": options.short_side, "download": options.download,
-                        "device": device},
-               "onnx": {"patch": options.patch, "device": device},
-               "folder": {"layout": options.layout}}.get(options.features.partition(":")[0], {})
+    choices = {
+        "clip": {
+            "method": options.method,
+            "short_side": options.short_side,
+            "download": options.download,
+            "device": device,
+        },
+        "onnx": {"patch": options.patch, "device": device},
+        "folder": {"layout": options.layout},
+    }.get(options.features.partition(":")[0], {})
     encoder = make_image_encoder(options.features, **choices)
-    given = {each.name: getattr(options, each.name) for each in dataclasses.fields(ReconstructOptions)}
+    given = {
+        each.name: getattr(options, each.name) for each in dataclasses.fields(ReconstructOptions)
+    }
     return reconstruct(Reconstruct(**given, settings=options.settings), encoder)

@@ -1,4 +1,6 @@
-"""What every data set is: a sequence of frames that can be sliced, loaded one by one when asked for."""
+"""What every data set is: a sequence of frames that can be sliced, loaded one by one when asked
+for.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +12,19 @@ from ..types import Frame
 
 
 class Dataset(ABC, Sequence[Frame]):
-    """Frames of one recording: `dataset[i]` loads frame i (or raises FrameError), `dataset[a:b:n]` is a view.
+    """Frames of one recording: `dataset[i]` loads frame i (or raises FrameError), `dataset[a:b:n]`
+    is a view.
 
-    `name` says what and where, for messages. Opening is cheap: it lists files, reads poses and intrinsics, and raises
-    DatasetError where there is nothing to read. `warnings` holds sentences on what was odd but usable.
+    `name` says what and where, for messages. Opening is cheap: it lists files, reads poses and
+    intrinsics, and raises DatasetError where there is nothing to read. `warnings` holds sentences
+    on what was odd but usable.
     """
 
     name: str
     warnings: tuple[str, ...] = ()
     no_poses: str = ""  # why none of its frames has a pose, where that is so
-    runs_kernels: bool = False  # whether loading launches kernels: those of two threads must not overlap
+    # whether loading launches kernels: those of two threads must not overlap
+    runs_kernels: bool = False
 
     @abstractmethod
     def __len__(self) -> int: ...

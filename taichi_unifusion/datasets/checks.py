@@ -1,4 +1,6 @@
-"""What is odd about a recording but usable, as sentences: its poses and camera (when opened), its depth scale (first frame)."""
+"""What is odd about a recording but usable, as sentences: its poses and camera (when opened), its
+depth scale (first frame).
+"""
 
 from __future__ import annotations
 
@@ -7,17 +9,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import PinholeCamera
 from ..files.poses import Pose
+from ..types import PinholeCamera
 
-MIN_IDENTITIES = 3     # the first frame often is the origin; more of them mean that nobody tracked
-MAX_JUMP = 1.0         # [m] between consecutive frames
-OFF_CENTRE = 0.15      # of the image size: lenses are centred better than this
+MIN_IDENTITIES = 3  # the first frame often is the origin; more of them mean that nobody tracked
+MAX_JUMP = 1.0  # [m] between consecutive frames
+OFF_CENTRE = 0.15  # of the image size: lenses are centred better than this
 
 PLAUSIBLE_MEDIAN = (0.05, 30.0)  # [m] of a depth image; outside it the scale is wrong
-TYPICAL_MEDIAN = (0.3, 10.0)     # [m] of indoor recordings
-COMMON_MEDIAN = 2.0              # [m] where two scales fit, the one nearer to this comes first
-KNOWN_SCALES = (1000.0, 5000.0, 6553.5, 10000.0, 1.0)  # units a metre: millimetres, TUM, Replica, 0.1 mm, metres
+TYPICAL_MEDIAN = (0.3, 10.0)  # [m] of indoor recordings
+COMMON_MEDIAN = 2.0  # [m] where two scales fit, the one nearer to this comes first
+# units a metre: millimetres, TUM, Replica, 0.1 mm, metres
+KNOWN_SCALES = (1000.0, 5000.0, 6553.5, 10000.0, 1.0)
 
 
 def pose_warnings(poses: Sequence[Pose]) -> list[str]:
@@ -25,37 +28,53 @@ def pose_warnings(poses: Sequence[Pose]) -> list[str]:
     if not poses:
         return []
     nothing = np.full((4, 4), np.nan)
-    T = np.stack([nothing if pose.T_world_camera is None else pose.T_world_camera for pose in poses])  # (N, 4, 4)
+    # (N, 4, 4)
+    T = np.stack(
+        [nothing if pose.T_world_camera is None else pose.T_world_camera for pose in poses]
+    )
     finite = np.isfinite(T).all(axis=(1, 2))
     T[~finite] = np.nan
     warnings = []
     if not finite.all():
         first = poses[int(np.argmin(finite))]
-        warnings.append(f"{np.sum(~finite)} of {len(poses)} frames have no usable pose and will be skipped (first: "
-                        f"{first.source}: {first.problem or 'NaN or infinite numbers'})")
-    identity = np.flatnonzero((T == np.eye(4)).all(axis=(1, 2)))
+        warnings.append(
+            f"{np.sum(~finite)} of {len(poses)} frames have no usable pose and will be skipped (first: "
+            f"{first.source}: {first.problem or 'NaN or infinite numbers'})"
+        )
+    identity = np.flatnonzero((np.eye(4) == T).all(axis=(1, 2)))
     if len(identity) >= MIN_IDENTITIES:
-        warnings.append(f"{len(identity)} of {len(poses)} frames have exactly the identity as pose (first: "
-                        f"{poses[identity[0]].source}); if the camera moved, tracking was lost there")
-    step = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)  # (N - 1,) [m], NaN beside a pose that is not finite
+        warnings.append(
+            f"{len(identity)} of {len(poses)} frames have exactly the identity as pose (first: "
+            f"{poses[identity[0]].source}); if the camera moved, tracking was lost there"
+        )
+    # (N - 1,) [m], NaN beside a pose that is not finite
+    step = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     jumps = np.flatnonzero(step > MAX_JUMP)
     if len(jumps):
-        warnings.append(f"the camera jumps more than {MAX_JUMP:g} m between consecutive frames, {len(jumps)} times (first: "
-                        f"{step[jumps[0]]:.2f} m to {poses[jumps[0] + 1].source})")
+        warnings.append(
+            f"the camera jumps more than {MAX_JUMP:g} m between consecutive frames, {len(jumps)} times (first: "
+            f"{step[jumps[0]]:.2f} m to {poses[jumps[0] + 1].source})"
+        )
     return warnings
 
 
 def camera_warnings(camera: PinholeCamera) -> list[str]:
-    """A sentence if the principal point lies so far from the centre that the intrinsics may be another resolution's."""
+    """A sentence if the principal point lies so far from the centre that the intrinsics may be
+    another resolution's.
+    """
     off = abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5)
     if max(off) <= OFF_CENTRE:
         return []
-    return [f"the principal point ({camera.cx:g}, {camera.cy:g}) lies far from the centre of the "
-            f"{camera.width}x{camera.height} depth images; are these the intrinsics of another resolution or camera?"]
+    return [
+        f"the principal point ({camera.cx:g}, {camera.cy:g}) lies far from the centre of the "
+        f"{camera.width}x{camera.height} depth images; are these the intrinsics of another resolution or camera?"
+    ]
 
 
 def guess_depth_scale(depth: NDArray[np.float32], current_scale: float) -> str | None:
-    """What the depth scale may really be, as a sentence, if the median depth [m] under `current_scale` is implausible."""
+    """What the depth scale may really be, as a sentence, if the median depth [m] under
+    `current_scale` is implausible.
+    """
     valid = depth[np.isfinite(depth) & (depth > 0)]
     if not len(valid):
         return None

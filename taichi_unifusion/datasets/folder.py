@@ -1,11 +1,14 @@
-"""Your own recording: a folder with `camera.yaml`, `depth/`, and, if there are any, `color/` and poses.
+"""Your own recording: a folder with `camera.yaml`, `depth/`, and, if there are any, `color/` and
+poses.
 
-Depth: `depth/NAME.png`, 16 bits, `depth_scale` units a metre (default 1000), 0 and 65535 no reading; or `depth/NAME.npy`,
-floats in metres. Colour: `color/NAME.png` or `.jpg`, registered to depth; another size of the same shape is resampled. Frames
-are the names, in the order of the numbers in them. Infrared, if any: `infrared/NAME.png`, one channel of 8 or 16 bits,
-registered to depth, for the frames that have one. Poses: camera-to-world in metres, camera x right, y down, z forward, as
-`poses/NAME.txt` (4x4 each), or `poses.txt` with rows `NAME tx ty tz qx qy qz qw` (a name that is a number may be a time stamp,
-matched within max_difference), or `poses.txt` with one row of 16 numbers for every frame, in their order.
+Depth: `depth/NAME.png`, 16 bits, `depth_scale` units a metre (default 1000), 0 and 65535 no
+reading; or `depth/NAME.npy`, floats in metres. Colour: `color/NAME.png` or `.jpg`, registered to
+depth; another size of the same shape is resampled. Frames are the names, in the order of the
+numbers in them. Infrared, if any: `infrared/NAME.png`, one channel of 8 or 16 bits, registered to
+depth, for the frames that have one. Poses: camera-to-world in metres, camera x right, y down, z
+forward, as `poses/NAME.txt` (4x4 each), or `poses.txt` with rows `NAME tx ty tz qx qy qz qw` (a
+name that is a number may be a time stamp, matched within max_difference), or `poses.txt` with one
+row of 16 numbers for every frame, in their order.
 """
 
 from __future__ import annotations
@@ -18,11 +21,6 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DatasetError
-from ..types import PinholeCamera
-from ..geometry.time_stamps import check_max_difference, nearest
-from .camera_yaml import CameraFile, read_camera_yaml
-from .intrinsics import check_size
-from .listing import list_names
 from ..files.poses import (
     Pose,
     TumRow,
@@ -33,15 +31,30 @@ from ..files.poses import (
     split_row,
     tum_row,
 )
+from ..geometry.time_stamps import check_max_difference, nearest
+from ..types import PinholeCamera
+from .camera_yaml import CameraFile, read_camera_yaml
+from .intrinsics import check_size
+from .listing import list_names
 from .recording import FrameFiles, Recording, depth_size
 
-DEPTH_SUFFIXES, COLOR_SUFFIXES, INFRARED_SUFFIXES = (".png", ".npy"), (".png", ".jpg", ".jpeg"), (".png",)
+DEPTH_SUFFIXES, COLOR_SUFFIXES, INFRARED_SUFFIXES = (
+    (".png", ".npy"),
+    (".png", ".jpg", ".jpeg"),
+    (".png",),
+)
 MAX_DIFFERENCE = 0.02  # [s]
 CAMERA_FILE = "camera.yaml"
 
 
-def open_folder(path: Path, *, depth_scale: float | None = None, camera: PinholeCamera | None = None, drop_alpha: bool = False,
-                max_difference: float = MAX_DIFFERENCE) -> Recording:
+def open_folder(
+    path: Path,
+    *,
+    depth_scale: float | None = None,
+    camera: PinholeCamera | None = None,
+    drop_alpha: bool = False,
+    max_difference: float = MAX_DIFFERENCE,
+) -> Recording:
     """The recording in folder `path`; a frame is a name that has a depth or a colour image."""
     check_max_difference(max_difference)
     settings = _settings(path, camera)
@@ -51,22 +64,43 @@ def open_folder(path: Path, *, depth_scale: float | None = None, camera: Pinhole
         raise DatasetError(f"{path / 'depth'}: no *.png (16 bits) or *.npy (metres) here")
     stems = in_order({*depth, *color})
     poses = _read_poses(_pose_source(path, settings), stems, max_difference)
-    frames = [FrameFiles(_file_of(stem, depth), _file_of(stem, color) if color else None, pose,
-                         finite_or_none(stem) if "." in stem else None, infrared.get(stem))
-              for stem, pose in zip(stems, poses, strict=True)]
+    frames = [
+        FrameFiles(
+            _file_of(stem, depth),
+            _file_of(stem, color) if color else None,
+            pose,
+            finite_or_none(stem) if "." in stem else None,
+            infrared.get(stem),
+        )
+        for stem, pose in zip(stems, poses, strict=True)
+    ]
     source = str(path / CAMERA_FILE) if camera is None else "camera"
     camera = check_size(camera or settings.camera(source), depth_size(frames), source)
-    return Recording(f"folder {path}", frames, camera, settings.depth_scale if depth_scale is None else depth_scale,
-                     invalid=settings.depth_invalid, fit_color=True, drop_alpha=drop_alpha,
-                     no_poses="" if any(poses) else f"{path}: no poses.txt and no poses/ here")
+    return Recording(
+        f"folder {path}",
+        frames,
+        camera,
+        settings.depth_scale if depth_scale is None else depth_scale,
+        invalid=settings.depth_invalid,
+        fit_color=True,
+        drop_alpha=drop_alpha,
+        no_poses="" if any(poses) else f"{path}: no poses.txt and no poses/ here",
+    )
 
 
 def in_order(stems: Iterable[str]) -> list[str]:
-    """File stems as people count: by value if all are numbers (time stamps), else with the numbers in them by value."""
+    """File stems as people count: by value if all are numbers (time stamps), else with the numbers
+    in them by value.
+    """
     stems = list(stems)
     if all(finite_or_none(stem) is not None for stem in stems):
         return sorted(stems, key=lambda stem: (float(stem), stem))
-    return sorted(stems, key=lambda stem: [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", stem))])
+    return sorted(
+        stems,
+        key=lambda stem: [
+            int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", stem))
+        ],
+    )
 
 
 def _settings(path: Path, camera: PinholeCamera | None) -> CameraFile:
@@ -82,11 +116,17 @@ def _images(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
     """Stem -> file of the images in `folder`; none if there is no such folder."""
     if not folder.exists():
         return {}
-    files = [folder / name for name in list_names(folder) if name.lower().endswith(tuple(suffixes)) and name[0] != "."]
+    files = [
+        folder / name
+        for name in list_names(folder)
+        if name.lower().endswith(tuple(suffixes)) and name[0] != "."
+    ]
     found = {file.stem: file for file in files}
     if len(found) < len(files):
         twice = next(file for file in files if found[file.stem] != file)
-        raise DatasetError(f"{folder}: {twice.name} and {found[twice.stem].name} are two images of one name, keep one")
+        raise DatasetError(
+            f"{folder}: {twice.name} and {found[twice.stem].name} are two images of one name, keep one"
+        )
     return found
 
 
@@ -101,11 +141,15 @@ def _pose_source(path: Path, settings: CameraFile) -> Path | None:
         return path / settings.poses
     found = [path / name for name in ("poses.txt", "poses") if (path / name).exists()]
     if len(found) > 1:
-        raise DatasetError(f"{path}: both poses.txt and poses/ are here; name the right one as 'poses:' in {CAMERA_FILE}")
+        raise DatasetError(
+            f"{path}: both poses.txt and poses/ are here; name the right one as 'poses:' in {CAMERA_FILE}"
+        )
     return found[0] if found else None
 
 
-def _read_poses(source: Path | None, stems: Sequence[str], max_difference: float) -> list[Pose | None]:
+def _read_poses(
+    source: Path | None, stems: Sequence[str], max_difference: float
+) -> list[Pose | None]:
     """The pose of every frame, in the order of `stems`; all None where no poses are given."""
     if source is None:
         return [None] * len(stems)
@@ -118,20 +162,30 @@ def _read_poses(source: Path | None, stems: Sequence[str], max_difference: float
     if columns == 8:
         return _named_poses([tum_row(*row) for row in rows], source, stems, max_difference)
     if columns != 16:
-        raise DatasetError(f"{first}: expected 8 columns (name tx ty tz qx qy qz qw) or 16 (a 4x4 matrix), found {columns}")
+        raise DatasetError(
+            f"{first}: expected 8 columns (name tx ty tz qx qy qz qw) or 16 (a 4x4 matrix), found {columns}"
+        )
     if len(rows) != len(stems):
-        raise DatasetError(f"{source}: {len(rows)} rows for {len(stems)} frames; rows of 16 numbers bear no names, so every "
-                           "frame needs one; else write rows of 'name tx ty tz qx qy qz qw'")
+        raise DatasetError(
+            f"{source}: {len(rows)} rows for {len(stems)} frames; rows of 16 numbers bear no names, so every "
+            "frame needs one; else write rows of 'name tx ty tz qx qy qz qw'"
+        )
     return [matrix_from_row(*row) for row in rows]
 
 
-def _named_poses(rows: Sequence[TumRow], source: Path, stems: Sequence[str], max_difference: float) -> list[Pose]:
+def _named_poses(
+    rows: Sequence[TumRow], source: Path, stems: Sequence[str], max_difference: float
+) -> list[Pose]:
     """For every stem the row of that name, else the row nearest in time if the stem is a number."""
     by_name: dict[str, TumRow] = {}
     for row in rows:
         if by_name.setdefault(row.name, row) is not row:
-            raise DatasetError(f"{row.source}: '{row.name}' appears again (first: {by_name[row.name].source}), keep one")
-    timed = sorted((row for row in rows if row.timestamp is not None), key=lambda row: row.timestamp)
+            raise DatasetError(
+                f"{row.source}: '{row.name}' appears again (first: {by_name[row.name].source}), keep one"
+            )
+    timed = sorted(
+        (row for row in rows if row.timestamp is not None), key=lambda row: row.timestamp
+    )
     times = np.array([row.timestamp for row in timed])
 
     def find(stem: str) -> TumRow | None:
@@ -143,8 +197,14 @@ def _named_poses(rows: Sequence[TumRow], source: Path, stems: Sequence[str], max
 
     found = [find(stem) for stem in stems]
     if not any(found):
-        raise DatasetError(f"{source}: no row belongs to a frame; the first column must be a frame's name like '{stems[0]}', "
-                           f"but is '{rows[0].name}'")
-    nothing = f"no row for it (its name in the first column, or a time stamp within {max_difference} s)"
-    return [row.pose() if row else Pose(f"{source} frame {stem}", problem=nothing)
-            for stem, row in zip(stems, found, strict=True)]
+        raise DatasetError(
+            f"{source}: no row belongs to a frame; the first column must be a frame's name like '{stems[0]}', "
+            f"but is '{rows[0].name}'"
+        )
+    nothing = (
+        f"no row for it (its name in the first column, or a time stamp within {max_difference} s)"
+    )
+    return [
+        row.pose() if row else Pose(f"{source} frame {stem}", problem=nothing)
+        for stem, row in zip(stems, found, strict=True)
+    ]

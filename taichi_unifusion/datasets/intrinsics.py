@@ -7,12 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DatasetError, InputError
-from ..types import PinholeCamera
 from ..files.poses import parse_numbers, read_lines, split_row
+from ..types import PinholeCamera
 
 
-def make_camera(source: str, size: tuple[int, int], fx: float, fy: float, cx: float, cy: float) -> PinholeCamera:
-    """The camera for depth images of `size` (width, height); an impossible one is a DatasetError naming its `source`."""
+def make_camera(
+    source: str, size: tuple[int, int], fx: float, fy: float, cx: float, cy: float
+) -> PinholeCamera:
+    """The camera for depth images of `size` (width, height); an impossible one is a DatasetError
+    naming its `source`.
+    """
     try:
         return PinholeCamera(*size, float(fx), float(fy), float(cx), float(cy))
     except InputError as error:
@@ -23,7 +27,9 @@ def read_matrix_camera(path: Path, size: tuple[int, int]) -> PinholeCamera:
     """The camera whose matrix K fills the file as 3x3 or in the corner of a 4x4, row-major."""
     words = [word for _, line in read_lines(path) for word in split_row(line)]
     if len(words) not in (9, 16):
-        raise DatasetError(f"{path}: expected a 3x3 or 4x4 intrinsic matrix, found {len(words)} numbers")
+        raise DatasetError(
+            f"{path}: expected a 3x3 or 4x4 intrinsic matrix, found {len(words)} numbers"
+        )
     side = 3 if len(words) == 9 else 4
     K = np.array(parse_numbers(words, str(path))).reshape(side, side)
     return make_camera(str(path), size, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
@@ -32,6 +38,8 @@ def read_matrix_camera(path: Path, size: tuple[int, int]) -> PinholeCamera:
 def check_size(camera: PinholeCamera, size: tuple[int, int], source: str) -> PinholeCamera:
     """The camera, if it is for depth images of `size` (width, height); else DatasetError."""
     if camera.size != size:
-        raise DatasetError(f"{source}: the intrinsics are for {camera.width}x{camera.height} images but the depth images are "
-                           f"{size[0]}x{size[1]}; pass the depth camera's own as camera=PinholeCamera(...)")
+        raise DatasetError(
+            f"{source}: the intrinsics are for {camera.width}x{camera.height} images but the depth images are "
+            f"{size[0]}x{size[1]}; pass the depth camera's own as camera=PinholeCamera(...)"
+        )
     return camera

@@ -1,13 +1,16 @@
-"""Recordings of an Azure Kinect, the `.mkv` that `k4arecorder` writes: depth, active infrared, colour and factory calibration.
+"""Recordings of an Azure Kinect, the `.mkv` that `k4arecorder` writes: depth, active infrared,
+colour and factory calibration.
 
-Depth and infrared are tracks of 16-bit big-endian images, depth in millimetres with 0 for no reading; colour is MJPEG, NV12 or
-YUY2; `calibration.json` is an attachment. Images are registered with the factory calibration, distortion included: to the
-depth camera (`align="depth"`, the default: depth keeps its pixels, colour is looked up), or to the colour camera
-(`align="color"`, as the paper does: depth and infrared are carried over). Either way a pixel has depth only where both cameras
-see its point. Infrared becomes the image "infrared", (H, W, 1), in units of 0..65535.
+Depth and infrared are tracks of 16-bit big-endian images, depth in millimetres with 0 for no
+reading; colour is MJPEG, NV12 or YUY2; `calibration.json` is an attachment. Images are registered
+with the factory calibration, distortion included: to the depth camera (`align="depth"`, the
+default: depth keeps its pixels, colour is looked up), or to the colour camera (`align="color"`, as
+the paper does: depth and infrared are carried over). Either way a pixel has depth only where both
+cameras see its point. Infrared becomes the image "infrared", (H, W, 1), in units of 0..65535.
 
-Poses: `NAME.txt` beside `NAME.mkv`, rows `timestamp tx ty tz qx qy qz qw` with the recording's seconds, camera-to-world of the
-camera that is aligned to. Without such a file the first frame's camera is the world, and other frames have no pose.
+Poses: `NAME.txt` beside `NAME.mkv`, rows `timestamp tx ty tz qx qy qz qw` with the recording's
+seconds, camera-to-world of the camera that is aligned to. Without such a file the first frame's
+camera is the world, and other frames have no pose.
 """
 
 from __future__ import annotations
@@ -22,25 +25,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError, FrameError, MissingDependency, check_choice
-from ..types import Frame
+from ..files.images import decode_color, depth_to_metres
+from ..files.poses import Pose, read_tum_rows
 from ..geometry.time_stamps import check_max_difference, nearest
+from ..types import Frame
 from .base import Dataset
 from .checks import pose_warnings
-from ..files.images import decode_color, depth_to_metres
 from .k4a_calibration import read_calibration
 from .lens_camera import color_for_depth, splat_depth
-from ..files.poses import Pose, read_tum_rows
 
 DEPTH_SCALE = 1000.0
 TRACKS = ("DEPTH", "COLOR", "IR")  # titles
-MAX_DIFFERENCE = 0.02              # [s] between a pose and a depth image
+MAX_DIFFERENCE = 0.02  # [s] between a pose and a depth image
 CALIBRATION = "calibration.json"
-FINER = 1.5                        # readings a pixel of the colour camera that keep depth free of holes there
+FINER = 1.5  # readings a pixel of the colour camera that keep depth free of holes there
 
 
-def open_k4a(path: Path, *, align: Literal["depth", "color"] = "depth", depth_scale: float | None = None,
-             max_difference: float = MAX_DIFFERENCE) -> K4aFile:
-    """The recording in file `path`; poses further than `max_difference` [s] from a depth image do not belong to it."""
+def open_k4a(
+    path: Path,
+    *,
+    align: Literal["depth", "color"] = "depth",
+    depth_scale: float | None = None,
+    max_difference: float = MAX_DIFFERENCE,
+) -> K4aFile:
+    """The recording in file `path`; poses further than `max_difference` [s] from a depth image do
+    not belong to it.
+    """
     check_choice("align", align, ("depth", "color"))
     check_max_difference(max_difference)
     return K4aFile(path, align, DEPTH_SCALE if depth_scale is None else depth_scale, max_difference)
@@ -48,7 +58,9 @@ def open_k4a(path: Path, *, align: Literal["depth", "color"] = "depth", depth_sc
 
 @dataclass(frozen=True)
 class Capture:
-    """Time stamps of the images of one frame, in the file's unit; None: the recording lacks that one."""
+    """Time stamps of the images of one frame, in the file's unit; None: the recording lacks that
+    one.
+    """
 
     depth: int
     color: int | None
@@ -63,27 +75,43 @@ class K4aFile(Dataset):
         with _opened(path) as container:
             streams = _tracks(container, path)
             self.sizes = {title: (stream.width, stream.height) for title, stream in streams.items()}
-            attached = next((s.data for s in container.streams.attachments if s.name == CALIBRATION), None)
+            attached = next(
+                (s.data for s in container.streams.attachments if s.name == CALIBRATION), None
+            )
             if attached is None:
-                raise DatasetError(f"{path}: no {CALIBRATION} is attached; was the recording converted by another program?")
-            self.calibration = read_calibration(attached, f"{path}: {CALIBRATION}", self.sizes["DEPTH"],
-                                                self.sizes.get("COLOR"))
-            self.unit = float(streams["DEPTH"].time_base)  # [s] of a time stamp; a Matroska file has one for all tracks
+                raise DatasetError(
+                    f"{path}: no {CALIBRATION} is attached; was the recording converted by another program?"
+                )
+            self.calibration = read_calibration(
+                attached, f"{path}: {CALIBRATION}", self.sizes["DEPTH"], self.sizes.get("COLOR")
+            )
+            # [s] of a time stamp; a Matroska file has one for all tracks
+            self.unit = float(streams["DEPTH"].time_base)
             stamps = {title: [] for title in streams}
             for packet in container.demux(*streams.values()):
                 if packet.pts is not None:
                     stamps[_title(packet.stream)].append(packet.pts)
-        self.captures = _captures({title: np.array(sorted(values)) for title, values in stamps.items()})
+        self.captures = _captures(
+            {title: np.array(sorted(values)) for title, values in stamps.items()}
+        )
         if not self.captures:
             raise DatasetError(f"{path}: holds no depth image")
         if align == "color" and self.calibration.color is None:
-            raise DatasetError(f"{path}: align 'color' needs a colour track, and this recording has none")
+            raise DatasetError(
+                f"{path}: align 'color' needs a colour track, and this recording has none"
+            )
         times = self.unit * np.array([capture.depth for capture in self.captures])
         self.poses = _read_poses(path.with_suffix(".txt"), times, max_difference)
-        self.warnings = tuple(pose_warnings([pose for pose in self.poses if pose.T_world_camera is not None or pose.problem]))
+        self.warnings = tuple(
+            pose_warnings(
+                [pose for pose in self.poses if pose.T_world_camera is not None or pose.problem]
+            )
+        )
         if any(pose.T_world_camera is None and not pose.problem for pose in self.poses):
-            self.warnings = (f"there is no {path.with_suffix('.txt').name} with poses beside {path.name}: the first frame's "
-                             "camera is the world, and the other frames have no pose",)
+            self.warnings = (
+                f"there is no {path.with_suffix('.txt').name} with poses beside {path.name}: the first frame's "
+                "camera is the world, and the other frames have no pose",
+            )
 
     @property
     def camera(self):
@@ -97,32 +125,49 @@ class K4aFile(Dataset):
         """Read and register frame `index`; FrameError (PoseError) names the file and the frame."""
         capture, where = self.captures[index], f"{self.path} frame {index}"
         pose = self.poses[index]
-        T_world_camera = None if pose.T_world_camera is None and not pose.problem else pose.checked()
+        T_world_camera = (
+            None if pose.T_world_camera is None and not pose.problem else pose.checked()
+        )
         images = self._read(capture, where)
         raw = images["DEPTH"]
         depth = depth_to_metres(raw, f"{where} depth", self.depth_scale, ())
-        infrared = images["IR"].astype(np.float32) if "IR" in images else np.zeros(raw.shape, np.float32)
+        infrared = (
+            images["IR"].astype(np.float32) if "IR" in images else np.zeros(raw.shape, np.float32)
+        )
         register = self._to_color if self.align == "color" else self._to_depth
         depth, color, infrared = register(depth, images.get("COLOR"), infrared)
-        frame = Frame(depth, self.camera, color, T_world_camera, index, capture.depth * self.unit, where)
+        frame = Frame(
+            depth, self.camera, color, T_world_camera, index, capture.depth * self.unit, where
+        )
         return frame.with_image("infrared", infrared) if "IR" in images else frame
 
-    def _to_depth(self, depth: NDArray, color: NDArray | None, infrared: NDArray) -> tuple[NDArray, NDArray | None, NDArray]:
+    def _to_depth(
+        self, depth: NDArray, color: NDArray | None, infrared: NDArray
+    ) -> tuple[NDArray, NDArray | None, NDArray]:
         cameras, camera = self.calibration, self.camera
         depth = cameras.depth.undistort_depth(depth, camera)
         infrared = cameras.depth.undistort(infrared, camera)
         if color is not None:
-            color, seen = color_for_depth(color, cameras.color, depth, camera, cameras.T_color_depth)
+            color, seen = color_for_depth(
+                color, cameras.color, depth, camera, cameras.T_color_depth
+            )
             depth[~seen] = 0
         return depth, color, infrared
 
-    def _to_color(self, depth: NDArray, color: NDArray | None, infrared: NDArray) -> tuple[NDArray, NDArray | None, NDArray]:
+    def _to_color(
+        self, depth: NDArray, color: NDArray | None, infrared: NDArray
+    ) -> tuple[NDArray, NDArray | None, NDArray]:
         cameras, camera = self.calibration, self.camera
         own = cameras.depth.pinhole
         factor = int(np.ceil(FINER * max(camera.fx / own.fx, camera.fy / own.fy)))
         finer = own.resized(own.width * factor, own.height * factor)
-        depth, infrared = splat_depth(cameras.depth.undistort_depth(depth, finer), cameras.depth.undistort(infrared, finer),
-                                      finer, camera, cameras.T_color_depth)
+        depth, infrared = splat_depth(
+            cameras.depth.undistort_depth(depth, finer),
+            cameras.depth.undistort(infrared, finer),
+            finer,
+            camera,
+            cameras.T_color_depth,
+        )
         depth[~cameras.color.sees(camera)] = 0
         return depth, None if color is None else cameras.color.undistort(color, camera), infrared
 
@@ -142,7 +187,9 @@ class K4aFile(Dataset):
                     break
         for title in wanted:
             if title not in images:
-                raise FrameError(f"{where}: its {title.lower()} image cannot be read; the recording is damaged there")
+                raise FrameError(
+                    f"{where}: its {title.lower()} image cannot be read; the recording is damaged there"
+                )
         return images
 
 
@@ -151,8 +198,14 @@ def _decode(packet, title: str, where: str) -> NDArray:
     stream = packet.stream
     if title != "COLOR":  # 16-bit big-endian, whatever the machine
         if packet.size != 2 * stream.width * stream.height:
-            raise FrameError(f"{where}: holds {packet.size} bytes, not those of {stream.width}x{stream.height} 16-bit pixels")
-        return np.frombuffer(bytes(packet), ">u2").reshape(stream.height, stream.width).astype(np.uint16)
+            raise FrameError(
+                f"{where}: holds {packet.size} bytes, not those of {stream.width}x{stream.height} 16-bit pixels"
+            )
+        return (
+            np.frombuffer(bytes(packet), ">u2")
+            .reshape(stream.height, stream.width)
+            .astype(np.uint16)
+        )
     if stream.codec_context.name == "mjpeg":
         return decode_color(bytes(packet), where)
     frames = packet.decode()
@@ -162,28 +215,48 @@ def _decode(packet, title: str, where: str) -> NDArray:
 
 
 def _captures(stamps: dict[str, NDArray[np.int64]]) -> list[Capture]:
-    """A frame for every depth image, with the colour and infrared images that belong to it: within half a period."""
+    """A frame for every depth image, with the colour and infrared images that belong to it: within
+    half a period.
+    """
     depth = stamps["DEPTH"]
     half = np.median(np.diff(depth)) / 2 if len(depth) > 1 else np.inf
     found: dict[str, list[int | None]] = {}
     for title in ("COLOR", "IR"):
         of = stamps.get(title, np.empty(0, np.int64))
-        near = of[nearest(of, depth)] if len(of) and len(depth) else np.full(len(depth), np.iinfo(np.int64).max)
-        found[title] = [int(stamp) if len(of) and abs(int(stamp) - int(at)) <= half else None
-                        for stamp, at in zip(near, depth, strict=True)]
-    return [Capture(int(at), color, infrared) for at, color, infrared in zip(depth, found["COLOR"], found["IR"], strict=True)]
+        near = (
+            of[nearest(of, depth)]
+            if len(of) and len(depth)
+            else np.full(len(depth), np.iinfo(np.int64).max)
+        )
+        found[title] = [
+            int(stamp) if len(of) and abs(int(stamp) - int(at)) <= half else None
+            for stamp, at in zip(near, depth, strict=True)
+        ]
+    return [
+        Capture(int(at), color, infrared)
+        for at, color, infrared in zip(depth, found["COLOR"], found["IR"], strict=True)
+    ]
 
 
 def _read_poses(file: Path, times: NDArray[np.float64], max_difference: float) -> list[Pose]:
-    """The pose of every frame, by its time [s]; without a file the first frame is the origin and nothing is known of others."""
+    """The pose of every frame, by its time [s]; without a file the first frame is the origin and
+    nothing is known of others.
+    """
     if not file.exists():
         return [Pose("first frame", np.eye(4)), *(Pose(f"no {file.name}") for _ in times[1:])]
     rows = sorted(read_tum_rows(file), key=lambda row: row.timestamp)
     if not rows:
         raise DatasetError(f"{file}: holds no poses")
-    stamps, nothing = np.array([row.timestamp for row in rows]), f"no pose within {max_difference} s of the frame"
-    return [rows[i].pose() if abs(stamps[i] - time) <= max_difference else Pose(str(file), problem=nothing)
-            for i, time in zip(nearest(stamps, times), times, strict=True)]
+    stamps, nothing = (
+        np.array([row.timestamp for row in rows]),
+        f"no pose within {max_difference} s of the frame",
+    )
+    return [
+        rows[i].pose()
+        if abs(stamps[i] - time) <= max_difference
+        else Pose(str(file), problem=nothing)
+        for i, time in zip(nearest(stamps, times), times, strict=True)
+    ]
 
 
 def _title(stream) -> str:
@@ -192,13 +265,19 @@ def _title(stream) -> str:
 
 def _tracks(container, path: Path) -> dict:
     """Title -> video stream of the tracks that are there; depth must be."""
-    streams = {_title(stream): stream for stream in container.streams.video if _title(stream) in TRACKS}
+    streams = {
+        _title(stream): stream for stream in container.streams.video if _title(stream) in TRACKS
+    }
     if "DEPTH" not in streams:
-        raise DatasetError(f"{path}: has no track DEPTH, only {', '.join(map(_title, container.streams.video)) or 'no video'}; "
-                           "is this a recording of an Azure Kinect?")
+        raise DatasetError(
+            f"{path}: has no track DEPTH, only {', '.join(map(_title, container.streams.video)) or 'no video'}; "
+            "is this a recording of an Azure Kinect?"
+        )
     for title in ("DEPTH", "IR"):
         if title in streams and streams[title].codec_context.pix_fmt != "gray16be":
-            raise DatasetError(f"{path}: track {title} is {streams[title].codec_context.pix_fmt}, not 16-bit big-endian")
+            raise DatasetError(
+                f"{path}: track {title} is {streams[title].codec_context.pix_fmt}, not 16-bit big-endian"
+            )
     return streams
 
 
@@ -210,13 +289,16 @@ def _opened(path: Path):
         with av.open(str(path)) as container:
             yield container
     except av.error.FFmpegError as error:
-        raise DatasetError(f"{path}: not a readable Matroska recording ({error.strerror})") from error
+        raise DatasetError(
+            f"{path}: not a readable Matroska recording ({error.strerror})"
+        ) from error
 
 
 def _import_av() -> ModuleType:
     try:
         import av
     except ImportError:
-        raise MissingDependency("recordings of an Azure Kinect are read with PyAV: "
-                                "pip install 'taichi-unifusion[k4a]'") from None
+        raise MissingDependency(
+            "recordings of an Azure Kinect are read with PyAV: pip install 'taichi-unifusion[k4a]'"
+        ) from None
     return av

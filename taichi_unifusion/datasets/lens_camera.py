@@ -1,4 +1,5 @@
-"""A camera with lens distortion, and images carried from it to a pinhole in its place and on to another camera beside it.
+"""A camera with lens distortion, and images carried from it to a pinhole in its place and on to
+another camera beside it.
 
 Distortion is the rational model of Brown and Conrady as OpenCV has it: k1 k2 p1 p2 k3 k4 k5 k6.
 """
@@ -15,8 +16,10 @@ from numpy.typing import NDArray
 from ..types import PinholeCamera
 
 SAME_SURFACE = 0.03  # relative depth step up to which neighbouring readings may be interpolated
-HIDDEN = 0.05        # relative depth behind the nearest reading in its neighbourhood from which a point is not seen
-MAX_RADIUS = 1.7     # tan of the angle off the axis to which a distortion model holds, where a calibration does not say
+# relative depth behind the nearest reading in its neighbourhood from which a point is not seen
+HIDDEN = 0.05
+# tan of the angle off the axis to which a distortion model holds, where a calibration does not say
+MAX_RADIUS = 1.7
 
 
 @dataclass(frozen=True)
@@ -28,16 +31,24 @@ class LensCamera:
     max_radius: float = MAX_RADIUS
 
     def undistort(self, image: NDArray, target: PinholeCamera) -> NDArray:
-        """Colours (H, W, 3) or measurements (H, W) as `target`, in the same place and direction, sees them; 0 outside."""
-        return cv2.remap(image, *_undistortion(self, target), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        """Colours (H, W, 3) or measurements (H, W) as `target`, in the same place and direction,
+        sees them; 0 outside.
+        """
+        return cv2.remap(
+            image, *_undistortion(self, target), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+        )
 
     def sees(self, target: PinholeCamera) -> NDArray[np.bool_]:
-        """Where (H, W) this camera's image covers what `target`, in the same place and direction, sees."""
+        """Where (H, W) this camera's image covers what `target`, in the same place and direction,
+        sees.
+        """
         map_x, map_y = _undistortion(self, target)
         width, height = self.pinhole.size
         return (map_x >= 0) & (map_y >= 0) & (map_x <= width - 1) & (map_y <= height - 1)
 
-    def undistort_depth(self, depth: NDArray[np.float32], target: PinholeCamera) -> NDArray[np.float32]:
+    def undistort_depth(
+        self, depth: NDArray[np.float32], target: PinholeCamera
+    ) -> NDArray[np.float32]:
         """The same for depth (H, W) [m], 0 none: never a mean across an edge."""
         map_x, map_y = _undistortion(self, target)
         left, top = np.floor(map_x), np.floor(map_y)
@@ -47,17 +58,31 @@ class LensCamera:
         at = np.where(inside, v * depth.shape[1] + u, 0)
         corners = [np.take(depth, at + step) for step in (0, 1, depth.shape[1], depth.shape[1] + 1)]
         low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
-        mean = (1 - b) * ((1 - a) * corners[0] + a * corners[1]) + b * ((1 - a) * corners[2] + a * corners[3])
-        nearest = np.where(b < 0.5, np.where(a < 0.5, *corners[:2]), np.where(a < 0.5, *corners[2:]))
+        mean = (1 - b) * ((1 - a) * corners[0] + a * corners[1]) + b * (
+            (1 - a) * corners[2] + a * corners[3]
+        )
+        nearest = np.where(
+            b < 0.5, np.where(a < 0.5, *corners[:2]), np.where(a < 0.5, *corners[2:])
+        )
         smooth = (low > 0) & (high - low <= SAME_SURFACE * low)
         return np.where(inside, np.where(smooth, mean, nearest), np.float32(0))
 
 
 @lru_cache(maxsize=8)
-def _undistortion(lens: LensCamera, target: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Column and row in the distorted image, both (H, W), of every pixel of `target`; -2 beyond the distortion model."""
-    map_x, map_y = cv2.initUndistortRectifyMap(lens.pinhole.matrix, np.array(lens.distortion), np.eye(3), target.matrix,
-                                               target.size, cv2.CV_32FC1)
+def _undistortion(
+    lens: LensCamera, target: PinholeCamera
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row in the distorted image, both (H, W), of every pixel of `target`; -2 beyond the
+    distortion model.
+    """
+    map_x, map_y = cv2.initUndistortRectifyMap(
+        lens.pinhole.matrix,
+        np.array(lens.distortion),
+        np.eye(3),
+        target.matrix,
+        target.size,
+        cv2.CV_32FC1,
+    )
     beyond = np.hypot(*cv2.split(camera_rays(target))[:2]) >= lens.max_radius
     map_x[beyond] = map_y[beyond] = -2
     return map_x, map_y
@@ -66,43 +91,74 @@ def _undistortion(lens: LensCamera, target: PinholeCamera) -> tuple[NDArray[np.f
 @lru_cache(maxsize=4)
 def camera_rays(camera: PinholeCamera) -> NDArray[np.float32]:
     """(H, W, 3) rays with z = 1."""
-    x, y = (np.arange(camera.width) - camera.cx) / camera.fx, (np.arange(camera.height) - camera.cy) / camera.fy
-    return np.dstack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))]).astype(np.float32)
+    x, y = (
+        (np.arange(camera.width) - camera.cx) / camera.fx,
+        (np.arange(camera.height) - camera.cy) / camera.fy,
+    )
+    return np.dstack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))]).astype(
+        np.float32
+    )
 
 
-def project_depth(depth: NDArray[np.float32], camera: PinholeCamera, target: PinholeCamera,
-                  T_target_camera: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Column, row and depth [m] in `target`, each (H, W), of the readings of `camera`; far outside for a point behind it."""
+def project_depth(
+    depth: NDArray[np.float32],
+    camera: PinholeCamera,
+    target: PinholeCamera,
+    T_target_camera: NDArray,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Column, row and depth [m] in `target`, each (H, W), of the readings of `camera`; far outside
+    for a point behind it.
+    """
     rays = cv2.transform(camera_rays(camera), T_target_camera[:3, :3])
-    x, y, z = (part * depth + np.float32(step) for part, step in zip(cv2.split(rays), T_target_camera[:3, 3], strict=True))
+    x, y, z = (
+        part * depth + np.float32(step)
+        for part, step in zip(cv2.split(rays), T_target_camera[:3, 3], strict=True)
+    )
     near = z < 1e-3
     per_depth = 1 / np.where(near, np.float32(1), z)
-    columns = np.where(near, np.float32(-1e6), np.float32(target.fx) * x * per_depth + np.float32(target.cx))
-    rows = np.where(near, np.float32(-1e6), np.float32(target.fy) * y * per_depth + np.float32(target.cy))
+    columns = np.where(
+        near, np.float32(-1e6), np.float32(target.fx) * x * per_depth + np.float32(target.cx)
+    )
+    rows = np.where(
+        near, np.float32(-1e6), np.float32(target.fy) * y * per_depth + np.float32(target.cy)
+    )
     return columns, rows, z
 
 
-def color_for_depth(color: NDArray[np.uint8], lens: LensCamera, depth: NDArray[np.float32], camera: PinholeCamera,
-                    T_color_camera: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Colour (H, W, 3) for every pixel of a depth image, and where (H, W) the colour camera sees the point of a reading.
+def color_for_depth(
+    color: NDArray[np.uint8],
+    lens: LensCamera,
+    depth: NDArray[np.float32],
+    camera: PinholeCamera,
+    T_color_camera: NDArray,
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Colour (H, W, 3) for every pixel of a depth image, and where (H, W) the colour camera sees
+    the point of a reading.
 
-    It does not where the point lies outside its image or behind something nearer. Pixels without a reading are coloured as if
-    they had their neighbours', so that the picture is whole.
+    It does not where the point lies outside its image or behind something nearer. Pixels without a
+    reading are coloured as if they had their neighbours', so that the picture is whole.
     """
     color_camera = lens.pinhole
     columns, rows, z = project_depth(_filled(depth), camera, color_camera, T_color_camera)
     width, height = color_camera.size
     inside = (columns > -0.5) & (rows > -0.5) & (columns < width - 0.5) & (rows < height - 0.5)
-    covered = cv2.erode(np.uint8(lens.sees(color_camera)), np.ones((3, 3)))  # the rim mixes with black
+    # the rim mixes with black
+    covered = cv2.erode(np.uint8(lens.sees(color_camera)), np.ones((3, 3)))
     covered = cv2.remap(covered, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
     known = inside & (depth > 0)
-    cell = 2 * max(color_camera.fx / camera.fx, 0.5)  # pixels of the colour camera: wide enough to hold a reading each
-    at = tuple(np.where(inside, np.maximum(pixels, 0) / cell, 0).astype(np.int32) for pixels in (rows, columns))
+    # pixels of the colour camera: wide enough to hold a reading each
+    cell = 2 * max(color_camera.fx / camera.fx, 0.5)
+    at = tuple(
+        np.where(inside, np.maximum(pixels, 0) / cell, 0).astype(np.int32)
+        for pixels in (rows, columns)
+    )
     nearest = np.full((int(height / cell) + 1, int(width / cell) + 1), np.inf, np.float32)
     np.minimum.at(nearest, (at[0][known], at[1][known]), z[known])
     seen = known & (covered > 0) & (z <= (1 + HIDDEN) * cv2.erode(nearest, np.ones((3, 3)))[at])
     undistorted = lens.undistort(color, color_camera)
-    return cv2.remap(undistorted, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), seen
+    return cv2.remap(
+        undistorted, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+    ), seen
 
 
 def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -110,18 +166,33 @@ def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     empty = (depth <= 0).astype(np.uint8)
     if not empty.any() or empty.all():
         return depth
-    _, labels = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    _, labels = cv2.distanceTransformWithLabels(
+        empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
     readings = np.zeros(labels.max() + 1, np.float32)
     readings[labels[empty == 0]] = depth[empty == 0]
     return readings[labels]
 
 
-def splat_depth(depth: NDArray[np.float32], values: NDArray[np.float32], camera: PinholeCamera, target: PinholeCamera,
-                T_target_camera: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth [m] and values of a camera as another one beside it sees them, the nearest reading of each pixel; 0 none."""
+def splat_depth(
+    depth: NDArray[np.float32],
+    values: NDArray[np.float32],
+    camera: PinholeCamera,
+    target: PinholeCamera,
+    T_target_camera: NDArray,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth [m] and values of a camera as another one beside it sees them, the nearest reading of
+    each pixel; 0 none.
+    """
     columns, rows, z = project_depth(depth, camera, target, T_target_camera)
     columns, rows = np.rint(columns).astype(np.int32), np.rint(rows).astype(np.int32)
-    inside = np.flatnonzero((depth > 0) & (columns >= 0) & (rows >= 0) & (columns < target.width) & (rows < target.height))
+    inside = np.flatnonzero(
+        (depth > 0)
+        & (columns >= 0)
+        & (rows >= 0)
+        & (columns < target.width)
+        & (rows < target.height)
+    )
     order = inside[np.argsort(-z.ravel()[inside], kind="stable")]  # the nearest is written last
     at = rows.ravel()[order], columns.ravel()[order]
     moved, moved_values = (np.zeros((target.height, target.width), np.float32) for _ in range(2))

@@ -34,7 +34,9 @@ def first_existing(paths: Iterable[Path]) -> Path | None:
 
 
 def file_of(number: int, found: dict[int, Path], folder: Path, template: str) -> Path:
-    """The file of frame `number`, or where it should be: named by the template, with the suffix that others have."""
+    """The file of frame `number`, or where it should be: named by the template, with the suffix
+    that others have.
+    """
     if number in found:
         return found[number]
     missing = folder / template.format(number)

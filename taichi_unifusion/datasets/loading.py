@@ -7,16 +7,18 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-from . import DatasetView
 from ..types import Frame
+from . import DatasetView
 
 
 def load_ahead(sequence: Sequence[Frame]) -> Iterator[Callable[[], Frame]]:
-    """One loader a frame, in order; a thread loads the next frame while the caller works on the one before.
+    """One loader a frame, in order; a thread loads the next frame while the caller works on the one
+    before.
 
     Calling the loader returns the frame or raises what loading it raised.
     """
-    if getattr(recording_of(sequence), "runs_kernels", False):  # launches from two threads must not overlap
+    # launches from two threads must not overlap
+    if getattr(recording_of(sequence), "runs_kernels", False):
         yield from (partial(sequence.__getitem__, i) for i in range(len(sequence)))
         return
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="load") as pool:

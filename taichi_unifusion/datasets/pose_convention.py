@@ -1,7 +1,9 @@
-"""Are the poses what they should be, camera to world with z forward? Two frames that overlap can tell.
+"""Are the poses what they should be, camera to world with z forward? Two frames that overlap can
+tell.
 
-Points of one frame, carried by the poses into another, should lie where that one measured them. Where they do not, but would
-under another reading of the same matrices, that reading is probably the right one.
+Points of one frame, carried by the poses into another, should lie where that one measured them.
+Where they do not, but would under another reading of the same matrices, that reading is probably
+the right one.
 """
 
 from __future__ import annotations
@@ -11,17 +13,22 @@ from numpy.typing import NDArray
 
 from ..types import Frame
 
-GRID = 48                 # points along each image axis
-TOLERANCE = 0.03          # share of the depth within which two measurements agree
-PLAUSIBLE, CLEARLY_BETTER = 0.5, 0.3  # agreement that a right reading has at least, and its lead over a wrong one
-MIN_POINTS = 100          # that another frame sees, to say anything
+GRID = 48  # points along each image axis
+TOLERANCE = 0.03  # share of the depth within which two measurements agree
+# agreement that a right reading has at least, and its lead over a wrong one
+PLAUSIBLE, CLEARLY_BETTER = 0.5, 0.3
+MIN_POINTS = 100  # that another frame sees, to say anything
 MIN_MOTION = 0.05, np.radians(3)  # [m], [rad]: with less, all readings agree
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 READINGS = {
     "world-to-camera matrices: invert them": lambda T: np.linalg.inv(T),
-    "OpenGL's axes (y up, z backward): multiply them from the right by diag(1, -1, -1, 1)": lambda T: T @ FLIP_YZ,
-    "world-to-camera matrices with OpenGL's axes: invert diag(1, -1, -1, 1) times each": lambda T: np.linalg.inv(FLIP_YZ @ T),
+    "OpenGL's axes (y up, z backward): multiply them from the right by diag(1, -1, -1, 1)": lambda T: (
+        T @ FLIP_YZ
+    ),
+    "world-to-camera matrices with OpenGL's axes: invert diag(1, -1, -1, 1) times each": lambda T: (
+        np.linalg.inv(FLIP_YZ @ T)
+    ),
 }
 
 
@@ -38,7 +45,9 @@ def agreement(a: Frame, b: Frame, T_b_a: NDArray[np.float64]) -> tuple[float, in
     v, u = (x.ravel() for x in np.meshgrid(v, u, indexing="ij"))
     z = a.depth[v, u].astype(np.float64)
     v, u, z = (x[np.isfinite(z) & (z > 0)] for x in (v, u, z))
-    points = np.stack([(u - a.camera.cx) / a.camera.fx * z, (v - a.camera.cy) / a.camera.fy * z, z], axis=1)
+    points = np.stack(
+        [(u - a.camera.cx) / a.camera.fx * z, (v - a.camera.cy) / a.camera.fy * z, z], axis=1
+    )
     x, y, depth = (points @ T_b_a[:3, :3].T + T_b_a[:3, 3]).T
     front = depth > 0.1
     u = np.round(b.camera.fx * x[front] / depth[front] + b.camera.cx)
@@ -49,17 +58,26 @@ def agreement(a: Frame, b: Frame, T_b_a: NDArray[np.float64]) -> tuple[float, in
     seen = np.isfinite(measured) & (measured > 0)
     if not seen.any():
         return 0.0, 0
-    return float((np.abs(measured - wanted)[seen] < TOLERANCE * wanted[seen]).mean()), int(seen.sum())
+    return float((np.abs(measured - wanted)[seen] < TOLERANCE * wanted[seen]).mean()), int(
+        seen.sum()
+    )
 
 
 def guess_pose_convention(a: Frame, b: Frame) -> tuple[bool, str | None]:
-    """Whether this pair of frames decides it, and a sentence if another reading of the poses fits far better."""
+    """Whether this pair of frames decides it, and a sentence if another reading of the poses fits
+    far better.
+    """
     given, seen_as_given = agreement(a, b, np.linalg.inv(b.T_world_camera) @ a.T_world_camera)
     scores = {}
     for reading, read in READINGS.items():
-        share, seen = agreement(a, b, np.linalg.inv(read(b.T_world_camera)) @ read(a.T_world_camera))
+        share, seen = agreement(
+            a, b, np.linalg.inv(read(b.T_world_camera)) @ read(a.T_world_camera)
+        )
         scores[reading] = share if seen >= MIN_POINTS else 0.0
     reading, best = max(scores.items(), key=lambda item: item[1])
     if best < max(given + CLEARLY_BETTER, PLAUSIBLE):
         return given >= PLAUSIBLE and seen_as_given >= MIN_POINTS, None
-    return True, f"depth agrees with the poses on {given:.0%} of the points, but on {best:.0%} if they are {reading}"
+    return (
+        True,
+        f"depth agrees with the poses on {given:.0%} of the points, but on {best:.0%} if they are {reading}",
+    )

@@ -1,6 +1,8 @@
-"""A recording kept as files, one depth image, one colour image and one pose a frame: what most formats come down to.
+"""A recording kept as files, one depth image, one colour image and one pose a frame: what most
+formats come down to.
 
-The modules beside this one list the files of their format and hand them over; loading is the same for all.
+The modules beside this one list the files of their format and hand them over; loading is the same
+for all.
 """
 
 from __future__ import annotations
@@ -14,9 +16,6 @@ from numbers import Real
 from pathlib import Path
 
 from ..errors import DatasetError, FrameError, InputError
-from ..types import Frame, PinholeCamera
-from .base import Dataset
-from .checks import camera_warnings, pose_warnings
 from ..files.images import (
     INVALID_DEPTH,
     depth_file_size,
@@ -27,6 +26,9 @@ from ..files.images import (
     resize_image,
 )
 from ..files.poses import Pose
+from ..types import Frame, PinholeCamera
+from .base import Dataset
+from .checks import camera_warnings, pose_warnings
 
 SIZE_SAMPLES = 5  # depth headers read to learn the size, so that one odd file does not decide it
 
@@ -45,19 +47,33 @@ class FrameFiles:
 class Recording(Dataset):
     """Frames read from files when asked for.
 
-    `depth_scale` is in units a metre, `invalid` the units that mean no reading, `fit_color` resamples colour of another size,
-    `no_poses` says what is missing where no frame has a pose.
+    `depth_scale` is in units a metre, `invalid` the units that mean no reading, `fit_color`
+    resamples colour of another size, `no_poses` says what is missing where no frame has a pose.
     """
 
-    def __init__(self, name: str, frames: Sequence[FrameFiles], camera: PinholeCamera, depth_scale: float, *,
-                 invalid: Collection[int] = INVALID_DEPTH, fit_color: bool = False, drop_alpha: bool = False,
-                 warnings: Iterable[str] = (), no_poses: str = "") -> None:
+    def __init__(
+        self,
+        name: str,
+        frames: Sequence[FrameFiles],
+        camera: PinholeCamera,
+        depth_scale: float,
+        *,
+        invalid: Collection[int] = INVALID_DEPTH,
+        fit_color: bool = False,
+        drop_alpha: bool = False,
+        warnings: Iterable[str] = (),
+        no_poses: str = "",
+    ) -> None:
         self.name, self.frames, self.camera = name, tuple(frames), camera
         self.depth_scale = check_depth_scale(depth_scale, name)
         self.invalid, self.fit_color, self.drop_alpha = tuple(invalid), fit_color, drop_alpha
         poses = [frame.pose for frame in self.frames if frame.pose is not None]
         self.no_poses = no_poses
-        self.pose_warnings = (f"{no_poses}, so the frames have no poses",) if no_poses else tuple(pose_warnings(poses))
+        self.pose_warnings = (
+            (f"{no_poses}, so the frames have no poses",)
+            if no_poses
+            else tuple(pose_warnings(poses))
+        )
         self.warnings = (*warnings, *camera_warnings(camera), *self.pose_warnings)
 
     def __len__(self) -> int:
@@ -67,7 +83,9 @@ class Recording(Dataset):
         """The same frames, their poses left out; so are the warnings about those."""
         bare = copy(self)
         bare.frames = tuple(replace(frame, pose=None) for frame in self.frames)
-        bare.warnings = tuple(warning for warning in self.warnings if warning not in self.pose_warnings)
+        bare.warnings = tuple(
+            warning for warning in self.warnings if warning not in self.pose_warnings
+        )
         return bare
 
     def load(self, index: int) -> Frame:
@@ -80,22 +98,31 @@ class Recording(Dataset):
             color = read_color(files.color, drop_alpha=self.drop_alpha)
             if self.fit_color:
                 color = resize_color(color, depth.shape[1], depth.shape[0], str(files.color))
-        frame = Frame(depth, self.camera, color, T_world_camera, index, files.timestamp, str(files.depth))
-        if files.infrared is None or not files.infrared.exists():  # a frame may lack it, as it may lack a reading
+        frame = Frame(
+            depth, self.camera, color, T_world_camera, index, files.timestamp, str(files.depth)
+        )
+        # a frame may lack it, as it may lack a reading
+        if files.infrared is None or not files.infrared.exists():
             return frame
         infrared = read_infrared(files.infrared)
-        return frame.with_image("infrared", resize_image(infrared, depth.shape[1], depth.shape[0], str(files.infrared)))
+        return frame.with_image(
+            "infrared", resize_image(infrared, depth.shape[1], depth.shape[0], str(files.infrared))
+        )
 
 
 def check_depth_scale(depth_scale: float, source: str) -> float:
     """The scale in units a metre, or InputError if it is no positive number."""
     if not (isinstance(depth_scale, Real) and math.isfinite(depth_scale) and depth_scale > 0):
-        raise InputError(f"{source}: depth_scale must be a positive number of units a metre, got {depth_scale}")
+        raise InputError(
+            f"{source}: depth_scale must be a positive number of units a metre, got {depth_scale}"
+        )
     return float(depth_scale)
 
 
 def depth_size(frames: Sequence[FrameFiles]) -> tuple[int, int]:
-    """(width, height) that most of a few depth images have, from their headers; DatasetError if none can be read."""
+    """(width, height) that most of a few depth images have, from their headers; DatasetError if
+    none can be read.
+    """
     sizes, problem = Counter(), None
     for frame in frames:
         try:

@@ -1,9 +1,11 @@
-"""TUM RGB-D: `rgb.txt` and `depth.txt` (`timestamp filename`), `groundtruth.txt` (`timestamp tx ty tz qx qy qz qw`).
+"""TUM RGB-D: `rgb.txt` and `depth.txt` (`timestamp filename`), `groundtruth.txt` (`timestamp tx ty
+tz qx qy qz qw`).
 
-Depth: 16 bits, 5000 units a metre, 0 no reading, registered to colour. Poses: camera-to-world in metres from motion capture,
-camera x right, y down, z forward. Colour and depth are paired by time stamp, one to one, nearest first; the pose is the
-ground truth nearest to the depth image's stamp. Intrinsics: the published ones of freiburg1, 2 or 3 if the folder's name says
-which, else the ROS default 525 525 319.5 239.5; lens distortion is ignored.
+Depth: 16 bits, 5000 units a metre, 0 no reading, registered to colour. Poses: camera-to-world in
+metres from motion capture, camera x right, y down, z forward. Colour and depth are paired by time
+stamp, one to one, nearest first; the pose is the ground truth nearest to the depth image's stamp.
+Intrinsics: the published ones of freiburg1, 2 or 3 if the folder's name says which, else the ROS
+default 525 525 319.5 239.5; lens distortion is ignored.
 """
 
 from __future__ import annotations
@@ -16,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DatasetError
-from ..types import PinholeCamera
+from ..files.poses import Pose, TumRow, finite_or_none, read_lines, read_tum_rows
 from ..geometry.time_stamps import associate, check_max_difference, nearest
+from ..types import PinholeCamera
 from .intrinsics import check_size
 from .listing import list_names
-from ..files.poses import Pose, TumRow, finite_or_none, read_lines, read_tum_rows
 from .recording import FrameFiles, Recording, depth_size
 
 DEPTH_SCALE = 5000.0
@@ -43,32 +45,58 @@ class Stamped:
     value: Path | TumRow
 
 
-def open_tum(path: Path, *, depth_scale: float | None = None, camera: PinholeCamera | None = None, drop_alpha: bool = False,
-             max_difference: float = MAX_DIFFERENCE) -> Recording:
-    """The sequence in folder `path`; stamps further apart than `max_difference` [s] do not belong together."""
+def open_tum(
+    path: Path,
+    *,
+    depth_scale: float | None = None,
+    camera: PinholeCamera | None = None,
+    drop_alpha: bool = False,
+    max_difference: float = MAX_DIFFERENCE,
+) -> Recording:
+    """The sequence in folder `path`; stamps further apart than `max_difference` [s] do not belong
+    together.
+    """
     check_max_difference(max_difference)
     missing = {"rgb.txt", "depth.txt"} - set(list_names(path))
     if missing:
-        raise DatasetError(f"{path}: no {' and no '.join(sorted(missing))} here; a TUM sequence has rgb.txt, depth.txt and "
-                           "groundtruth.txt")
+        raise DatasetError(
+            f"{path}: no {' and no '.join(sorted(missing))} here; a TUM sequence has rgb.txt, depth.txt and "
+            "groundtruth.txt"
+        )
     warnings: list[str] = []
     color = _in_time_order(_read_image_list(path / "rgb.txt"), warnings)
     depth = _in_time_order(_read_image_list(path / "depth.txt"), warnings)
     pairs = associate(_stamps(depth), _stamps(color), max_difference)
     if not len(pairs):
-        raise DatasetError(f"{path}: none of {len(color)} colour and {len(depth)} depth images are within {max_difference} s "
-                           "of each other; raise max_difference if their clocks differ")
+        raise DatasetError(
+            f"{path}: none of {len(color)} colour and {len(depth)} depth images are within {max_difference} s "
+            "of each other; raise max_difference if their clocks differ"
+        )
     alone = len(color) - len(pairs), len(depth) - len(pairs)
     if any(alone):
-        warnings.append(f"{alone[0]} colour and {alone[1]} depth images have no partner within {max_difference} s, left out")
+        warnings.append(
+            f"{alone[0]} colour and {alone[1]} depth images have no partner within {max_difference} s, left out"
+        )
     depth = [depth[i] for i, _ in pairs]
     truth = path / "groundtruth.txt"
-    poses = _poses_for(depth, truth, max_difference, warnings) if truth.exists() else [None] * len(depth)
-    frames = [FrameFiles(image.value, color[j].value, pose, image.timestamp)
-              for image, (_, j), pose in zip(depth, pairs, poses, strict=True)]
-    return Recording(f"tum {path}", frames, _camera(path, frames, camera, warnings),
-                     DEPTH_SCALE if depth_scale is None else depth_scale, drop_alpha=drop_alpha, warnings=warnings,
-                     no_poses="" if truth.exists() else f"{truth}: no such file")
+    poses = (
+        _poses_for(depth, truth, max_difference, warnings)
+        if truth.exists()
+        else [None] * len(depth)
+    )
+    frames = [
+        FrameFiles(image.value, color[j].value, pose, image.timestamp)
+        for image, (_, j), pose in zip(depth, pairs, poses, strict=True)
+    ]
+    return Recording(
+        f"tum {path}",
+        frames,
+        _camera(path, frames, camera, warnings),
+        DEPTH_SCALE if depth_scale is None else depth_scale,
+        drop_alpha=drop_alpha,
+        warnings=warnings,
+        no_poses="" if truth.exists() else f"{truth}: no such file",
+    )
 
 
 def _read_image_list(file: Path) -> list[Stamped]:
@@ -91,8 +119,10 @@ def _in_time_order(items: Sequence[Stamped], warnings: list[str]) -> list[Stampe
         kept.setdefault(item.timestamp, item)
     if len(kept) < len(items):
         again = next(item for item in items if kept[item.timestamp] is not item)
-        warnings.append(f"{again.line}: time stamp {again.timestamp!r} appears again; of equal stamps the first counts "
-                        f"({len(items) - len(kept)} left out)")
+        warnings.append(
+            f"{again.line}: time stamp {again.timestamp!r} appears again; of equal stamps the first counts "
+            f"({len(items) - len(kept)} left out)"
+        )
     return sorted(kept.values(), key=lambda item: item.timestamp)
 
 
@@ -100,20 +130,32 @@ def _stamps(items: Sequence[Stamped]) -> np.ndarray:
     return np.array([item.timestamp for item in items])
 
 
-def _poses_for(depth: Sequence[Stamped], file: Path, max_difference: float, warnings: list[str]) -> list[Pose]:
+def _poses_for(
+    depth: Sequence[Stamped], file: Path, max_difference: float, warnings: list[str]
+) -> list[Pose]:
     """The ground truth nearest to each depth image, or why there is none."""
-    truth = _in_time_order([Stamped(row.timestamp, row.source, row) for row in read_tum_rows(file)], warnings)
+    truth = _in_time_order(
+        [Stamped(row.timestamp, row.source, row) for row in read_tum_rows(file)], warnings
+    )
     if not truth:
         raise DatasetError(f"{file}: holds no poses")
     poses = []
     for image, found in zip(depth, nearest(_stamps(truth), _stamps(depth)), strict=True):
         gap = abs(truth[found].timestamp - image.timestamp)
-        poses.append(truth[found].value.pose() if gap <= max_difference else
-                     Pose(str(file), problem=f"nearest pose to {image.value} is {gap:.3f} s off, more than {max_difference} s"))
+        poses.append(
+            truth[found].value.pose()
+            if gap <= max_difference
+            else Pose(
+                str(file),
+                problem=f"nearest pose to {image.value} is {gap:.3f} s off, more than {max_difference} s",
+            )
+        )
     return poses
 
 
-def _camera(path: Path, frames: Sequence[FrameFiles], camera: PinholeCamera | None, warnings: list[str]) -> PinholeCamera:
+def _camera(
+    path: Path, frames: Sequence[FrameFiles], camera: PinholeCamera | None, warnings: list[str]
+) -> PinholeCamera:
     size = depth_size(frames)
     if camera is not None:
         return check_size(camera, size, "camera")
@@ -121,6 +163,8 @@ def _camera(path: Path, frames: Sequence[FrameFiles], camera: PinholeCamera | No
     name = f"freiburg{match[1]}" if match else "the ROS default"
     camera = check_size(CAMERAS[name] if match else ROS_CAMERA, size, f"{path}: {name}")
     reason = "from the folder's name" if match else "as the folder's name tells no other"
-    warnings.append(f"intrinsics assumed: {name} ({camera.fx:g} {camera.fy:g} {camera.cx:g} {camera.cy:g}, distortion ignored) "
-                    f"{reason}; pass camera=PinholeCamera(...) to change them")
+    warnings.append(
+        f"intrinsics assumed: {name} ({camera.fx:g} {camera.fy:g} {camera.cx:g} {camera.cy:g}, distortion ignored) "
+        f"{reason}; pass camera=PinholeCamera(...) to change them"
+    )
     return camera

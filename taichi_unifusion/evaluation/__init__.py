@@ -1,4 +1,6 @@
-"""The paper's metrics (Sec. VI-A): surface, rendering, trajectory and segmentation. Names load when they are used."""
+"""The paper's metrics (Sec. VI-A): surface, rendering, trajectory and segmentation. Names load when
+they are used.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,18 @@ if TYPE_CHECKING:
     from .trajectory import TrajectoryResult, evaluate_trajectory
     from .visibility import Views
 
-__all__ = ["SurfaceResult", "evaluate_surface", "Views", "RenderingResult", "evaluate_rendering", "TrajectoryResult", "evaluate_trajectory", "SegmentationResult", "evaluate_segmentation", "transfer_labels"]
+__all__ = [
+    "SurfaceResult",
+    "evaluate_surface",
+    "Views",
+    "RenderingResult",
+    "evaluate_rendering",
+    "TrajectoryResult",
+    "evaluate_trajectory",
+    "SegmentationResult",
+    "evaluate_segmentation",
+    "transfer_labels",
+]
 
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,

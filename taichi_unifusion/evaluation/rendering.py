@@ -1,4 +1,6 @@
-"""Rendering metrics: depth and colour of a mesh, seen from given poses, against images taken there (Sec. VI-A, Table III)."""
+"""Rendering metrics: depth and colour of a mesh, seen from given poses, against images taken there
+(Sec. VI-A, Table III).
+"""
 
 from __future__ import annotations
 
@@ -9,37 +11,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, PoseError
-from ..types import Frame, Mesh
 from ..rendering.raycaster import RayCaster
+from ..types import Frame, Mesh
 
-WITHIN = 0.025       # [m] an error below it counts as a good reading
-SSIM_SIGMA = 1.5     # [px] of the Gaussian window, with the constants below as Wang et al. 2004 give them
-SSIM_RADIUS = 5      # [px]
+WITHIN = 0.025  # [m] an error below it counts as a good reading
+# [px] of the Gaussian window, with the constants below as Wang et al. 2004 give them
+SSIM_SIGMA = 1.5
+SSIM_RADIUS = 5  # [px]
 SSIM_CONSTANTS = (0.01**2, 0.03**2)  # for values in [0, 1]
 
-ColorAt = Callable[[NDArray], NDArray]  # points (N, 3) world [m] -> RGB (N, 3) in [0, 1]; `PropertyMap.query` is one
+# points (N, 3) world [m] -> RGB (N, 3) in [0, 1]; `PropertyMap.query` is one
+ColorAt = Callable[[NDArray], NDArray]
 
 
 @dataclass(frozen=True)
 class RenderedFrame:
     """What a camera would see of a reconstruction."""
 
-    depth: NDArray[np.float32]          # (H, W) [m], inf where nothing is hit
-    color: NDArray[np.float32] | None   # (H, W, 3) RGB in [0, 1], 0 where nothing is hit
+    depth: NDArray[np.float32]  # (H, W) [m], inf where nothing is hit
+    color: NDArray[np.float32] | None  # (H, W, 3) RGB in [0, 1], 0 where nothing is hit
 
 
 @dataclass(frozen=True)
 class FrameScore:
     """One rendered image against one taken image; None where there was nothing to compare."""
 
-    index: int                     # of the frame in its recording
-    readings: int                  # depth readings in range
-    coverage: float | None         # share of the readings, 0..1, where the ray hits the mesh
-    depth_l1_cm: float | None      # mean |rendered - read| where there are both
+    index: int  # of the frame in its recording
+    readings: int  # depth readings in range
+    coverage: float | None  # share of the readings, 0..1, where the ray hits the mesh
+    depth_l1_cm: float | None  # mean |rendered - read| where there are both
     depth_median_cm: float | None  # median of the same
-    depth_within: float | None     # share of all readings, 0..1, with a hit less than 2.5 cm off
-    psnr_db: float | None          # of colour where there are a reading and a hit
-    ssim: float | None             # mean over the same pixels
+    depth_within: float | None  # share of all readings, 0..1, with a hit less than 2.5 cm off
+    psnr_db: float | None  # of colour where there are a reading and a hit
+    ssim: float | None  # mean over the same pixels
 
 
 @dataclass(frozen=True)
@@ -58,27 +62,42 @@ class RenderingResult:
 MEANS = ("depth_l1_cm", "depth_median_cm", "depth_within", "coverage", "psnr_db", "ssim")
 
 
-def evaluate_rendering(mesh: Mesh, frames: Iterable[Frame], *, color: ColorAt | None = None, depth_min: float = 0.1,
-                       depth_max: float = 5.0) -> RenderingResult:
+def evaluate_rendering(
+    mesh: Mesh,
+    frames: Iterable[Frame],
+    *,
+    color: ColorAt | None = None,
+    depth_min: float = 0.1,
+    depth_max: float = 5.0,
+) -> RenderingResult:
     """Compare images with the mesh rendered at their poses.
 
-    Depth is that of the rays through the pixel centres, from either side of the surface. Colour is `color` at the points hit
-    (the query of a colour LIM, as published), else the mesh's vertex colours, else none. Compared are pixels whose reading lies
-    in depth_min..depth_max [m] and whose ray hits; what is not hit lowers `coverage` and `depth_within` only.
+    Depth is that of the rays through the pixel centres, from either side of the surface. Colour is
+    `color` at the points hit (the query of a colour LIM, as published), else the mesh's vertex
+    colours, else none. Compared are pixels whose reading lies in depth_min..depth_max [m] and whose
+    ray hits; what is not hit lowers `coverage` and `depth_within` only.
 
-    Raises InputError for a mesh that is empty or not finite, where there is no frame, or no frame with a reading in range;
-    PoseError for a frame without a pose.
+    Raises InputError for a mesh that is empty or not finite, where there is no frame, or no frame
+    with a reading in range; PoseError for a frame without a pose.
     """
     if not 0 <= depth_min < depth_max:
-        raise InputError(f"rendering: need 0 <= depth_min < depth_max, got {depth_min} and {depth_max}")
+        raise InputError(
+            f"rendering: need 0 <= depth_min < depth_max, got {depth_min} and {depth_max}"
+        )
     caster = RayCaster(mesh, "reconstruction")
-    scores = tuple(_score(render_frame(caster, frame, color), frame, depth_min, depth_max) for frame in frames)
+    scores = tuple(
+        _score(render_frame(caster, frame, color), frame, depth_min, depth_max) for frame in frames
+    )
     if not scores:
         raise InputError("rendering: there are no frames to compare with")
     if not any(score.readings for score in scores):
-        raise InputError(f"rendering: none of {len(scores)} frames has a depth reading in {depth_min:g}..{depth_max:g} m; "
-                         "is the depth scale wrong?")
-    return RenderingResult(*(_mean([getattr(score, name) for score in scores]) for name in MEANS), scores)
+        raise InputError(
+            f"rendering: none of {len(scores)} frames has a depth reading in {depth_min:g}..{depth_max:g} m; "
+            "is the depth scale wrong?"
+        )
+    return RenderingResult(
+        *(_mean([getattr(score, name) for score in scores]) for name in MEANS), scores
+    )
 
 
 def render_frame(caster: RayCaster, frame: Frame, color: ColorAt | None = None) -> RenderedFrame:
@@ -91,7 +110,11 @@ def render_frame(caster: RayCaster, frame: Frame, color: ColorAt | None = None) 
         return RenderedFrame(hits.depth, None)
     image = np.zeros((*hits.depth.shape, 3), np.float32)
     if hits.hit.any():
-        values = color(hits.points(hits.hit)) if color else caster.interpolate(hits, hits.hit, vertex_colors)
+        values = (
+            color(hits.points(hits.hit))
+            if color
+            else caster.interpolate(hits, hits.hit, vertex_colors)
+        )
         if values.shape[1:] != (3,):
             raise InputError(f"rendering: colours must be (N, 3) RGB in [0, 1], got {values.shape}")
         image[hits.hit] = np.clip(values, 0, 1)
@@ -106,37 +129,55 @@ def _score(rendered: RenderedFrame, frame: Frame, depth_min: float, depth_max: f
     if not readings:
         return FrameScore(frame.index, 0, None, None, None, None, None, None)
     error = np.abs(rendered.depth[both].astype(np.float64) - frame.depth[both])
-    l1, median = (100 * float(error.mean()), 100 * float(np.median(error))) if compared else (None, None)
+    l1, median = (
+        (100 * float(error.mean()), 100 * float(np.median(error))) if compared else (None, None)
+    )
     psnr_db = structure = None
     if compared and rendered.color is not None and frame.color is not None:
         taken = frame.color.astype(np.float32) / np.float32(255)
         psnr_db, structure = psnr(rendered.color, taken, both), ssim(rendered.color, taken, both)
-    return FrameScore(frame.index, readings, compared / readings, l1, median, float((error < WITHIN).sum()) / readings, psnr_db,
-                      structure)
+    return FrameScore(
+        frame.index,
+        readings,
+        compared / readings,
+        l1,
+        median,
+        float((error < WITHIN).sum()) / readings,
+        psnr_db,
+        structure,
+    )
 
 
 def psnr(image: NDArray, reference: NDArray, mask: NDArray[np.bool_]) -> float:
-    """Peak signal-to-noise ratio [dB] over the pixels (H, W) of `mask`, of images (H, W, c) in [0, 1]; inf for equal ones."""
+    """Peak signal-to-noise ratio [dB] over the pixels (H, W) of `mask`, of images (H, W, c) in [0,
+    1]; inf for equal ones.
+    """
     squared = float(np.mean((image[mask].astype(np.float64) - reference[mask]) ** 2))
     return -10 * float(np.log10(squared)) if squared > 0 else float("inf")
 
 
 def ssim(image: NDArray, reference: NDArray, mask: NDArray[np.bool_]) -> float | None:
-    """Mean structural similarity (Wang et al. 2004) over the pixels (H, W) of `mask`, of images (H, W, c) in [0, 1].
+    """Mean structural similarity (Wang et al. 2004) over the pixels (H, W) of `mask`, of images (H,
+    W, c) in [0, 1].
 
-    Each pixel's Gaussian window takes in the pixels of `mask` only, with weights that sum to 1 over those, so that what a hole
-    holds plays no part. Pixels within 5 of the image's border are left out, as scikit-image does; None where none is left.
+    Each pixel's Gaussian window takes in the pixels of `mask` only, with weights that sum to 1 over
+    those, so that what a hole holds plays no part. Pixels within 5 of the image's border are left
+    out, as scikit-image does; None where none is left.
     """
     import cv2
 
     kept = mask.copy()
-    kept[:SSIM_RADIUS] = kept[-SSIM_RADIUS:] = kept[:, :SSIM_RADIUS] = kept[:, -SSIM_RADIUS:] = False
+    kept[:SSIM_RADIUS] = kept[-SSIM_RADIUS:] = kept[:, :SSIM_RADIUS] = kept[:, -SSIM_RADIUS:] = (
+        False
+    )
     if not kept.any():
         return None
 
     def blur(values: NDArray) -> NDArray:
         size = 2 * SSIM_RADIUS + 1
-        return cv2.GaussianBlur(values, (size, size), SSIM_SIGMA, borderType=cv2.BORDER_CONSTANT)[kept]
+        return cv2.GaussianBlur(values, (size, size), SSIM_SIGMA, borderType=cv2.BORDER_CONSTANT)[
+            kept
+        ]
 
     inside = mask.astype(np.float64)
     weight = blur(inside)
@@ -147,8 +188,13 @@ def ssim(image: NDArray, reference: NDArray, mask: NDArray[np.bool_]) -> float |
         var_x, var_y = blur(x * x) / weight - mean_x**2, blur(y * y) / weight - mean_y**2
         covariance = blur(x * y) / weight - mean_x * mean_y
         c1, c2 = SSIM_CONSTANTS
-        totals.append(np.mean((2 * mean_x * mean_y + c1) * (2 * covariance + c2)
-                              / ((mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2))))
+        totals.append(
+            np.mean(
+                (2 * mean_x * mean_y + c1)
+                * (2 * covariance + c2)
+                / ((mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2))
+            )
+        )
     return float(np.mean(totals))
 
 

@@ -1,4 +1,6 @@
-"""Segmentation metrics: IoU and accuracy of labels, by class and over seen and unseen classes (Sec. VI-A, Tables V-VII)."""
+"""Segmentation metrics: IoU and accuracy of labels, by class and over seen and unseen classes (Sec.
+VI-A, Tables V-VII).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 
-UNLABELLED = -1     # of a point without a label
+UNLABELLED = -1  # of a point without a label
 MAX_CLASSES = 10_000
 
 
@@ -20,10 +22,10 @@ class ClassScore:
 
     label: int
     name: str
-    iou: float        # right / (right + missed + wrongly given), 0..1
-    accuracy: float   # right / (right + missed), 0..1
-    points: int       # of the truth
-    seen: bool        # whether a method was trained with it
+    iou: float  # right / (right + missed + wrongly given), 0..1
+    accuracy: float  # right / (right + missed), 0..1
+    points: int  # of the truth
+    seen: bool  # whether a method was trained with it
 
 
 @dataclass(frozen=True)
@@ -40,36 +42,52 @@ class SegmentationResult:
     """How predicted labels compare with the true ones."""
 
     mean_iou: float
-    mean_accuracy: float       # over classes
-    overall_accuracy: float    # over points
-    seen: GroupScore | None    # None where no class was said to be unseen, or none of the kind occurs
+    mean_accuracy: float  # over classes
+    overall_accuracy: float  # over points
+    seen: GroupScore | None  # None where no class was said to be unseen, or none of the kind occurs
     unseen: GroupScore | None
     classes: tuple[ClassScore, ...]
-    points: int                # compared
-    ignored: int               # left out, because their true label says so
-    unlabelled: int            # compared, without a predicted label: these count as missed
+    points: int  # compared
+    ignored: int  # left out, because their true label says so
+    unlabelled: int  # compared, without a predicted label: these count as missed
 
 
-def evaluate_segmentation(predicted: NDArray, truth: NDArray, *, names: Mapping[int, str] | None = None,
-                          ignore: Collection[int] = (UNLABELLED,), unseen: Collection[int] = ()) -> SegmentationResult:
+def evaluate_segmentation(
+    predicted: NDArray,
+    truth: NDArray,
+    *,
+    names: Mapping[int, str] | None = None,
+    ignore: Collection[int] = (UNLABELLED,),
+    unseen: Collection[int] = (),
+) -> SegmentationResult:
     """Compare labels (N,) of the same points, whole numbers.
 
-    Points whose true label is in `ignore` are left out; where `names` (label -> name) are given, so are true labels that have
-    none. Means are over the classes that occur in the truth. A predicted label of any other class, -1 among them, makes a point
-    missed, never left out. `unseen` are the classes that a trained method did not train with.
+    Points whose true label is in `ignore` are left out; where `names` (label -> name) are given, so
+    are true labels that have none. Means are over the classes that occur in the truth. A predicted
+    label of any other class, -1 among them, makes a point missed, never left out. `unseen` are the
+    classes that a trained method did not train with.
 
-    Raises InputError for labels that are no whole numbers or not as many, or where nothing is left to compare.
+    Raises InputError for labels that are no whole numbers or not as many, or where nothing is left
+    to compare.
     """
     predicted, truth = _labels(predicted, "predicted labels"), _labels(truth, "true labels")
     if len(predicted) != len(truth):
-        raise InputError(f"segmentation: {len(predicted)} predicted labels but {len(truth)} true ones; both must be of the "
-                         "same points")
+        raise InputError(
+            f"segmentation: {len(predicted)} predicted labels but {len(truth)} true ones; both must be of the "
+            "same points"
+        )
     known = np.unique(truth)
-    labels = known[~np.isin(known, list(ignore)) & (np.isin(known, list(names)) if names is not None else True)]
+    labels = known[
+        ~np.isin(known, list(ignore)) & (np.isin(known, list(names)) if names is not None else True)
+    ]
     if not len(labels):
-        raise InputError(f"segmentation: no point is left of {len(truth)}; every true label is ignored or has no name")
+        raise InputError(
+            f"segmentation: no point is left of {len(truth)}; every true label is ignored or has no name"
+        )
     if len(labels) > MAX_CLASSES:
-        raise InputError(f"segmentation: {len(labels)} different true labels; are these labels of classes?")
+        raise InputError(
+            f"segmentation: {len(labels)} different true labels; are these labels of classes?"
+        )
     for label in unseen:
         if names is not None and label not in names:
             raise InputError(f"segmentation: unseen class {label} is not among the names")
@@ -78,29 +96,53 @@ def evaluate_segmentation(predicted: NDArray, truth: NDArray, *, names: Mapping[
     matrix = confusion_matrix(predicted, truth, labels)
     right, of_truth, given = np.diag(matrix), matrix.sum(axis=1), matrix[:, :-1].sum(axis=0)
     iou, accuracy = right / (of_truth + given - right), right / of_truth
-    classes = tuple(ClassScore(label, names[label] if names else str(label), float(iou[i]), float(accuracy[i]),
-                               int(of_truth[i]), label not in unseen) for i, label in enumerate(labels.tolist()))
+    classes = tuple(
+        ClassScore(
+            label,
+            names[label] if names else str(label),
+            float(iou[i]),
+            float(accuracy[i]),
+            int(of_truth[i]),
+            label not in unseen,
+        )
+        for i, label in enumerate(labels.tolist())
+    )
     whole = _group(classes)
     return SegmentationResult(
-        whole.mean_iou, whole.mean_accuracy, float(right.sum() / len(truth)),
+        whole.mean_iou,
+        whole.mean_accuracy,
+        float(right.sum() / len(truth)),
         _group([score for score in classes if score.seen]) if unseen else None,
-        _group([score for score in classes if not score.seen]), classes, len(truth), int((~kept).sum()),
-        int((predicted == UNLABELLED).sum()))
+        _group([score for score in classes if not score.seen]),
+        classes,
+        len(truth),
+        int((~kept).sum()),
+        int((predicted == UNLABELLED).sum()),
+    )
 
 
 def confusion_matrix(predicted: NDArray, truth: NDArray, labels: NDArray) -> NDArray[np.int64]:
-    """Counts (C, C + 1): row for the true class, column for the predicted one, the last for labels that are none of `labels`.
+    """Counts (C, C + 1): row for the true class, column for the predicted one, the last for labels
+    that are none of `labels`.
 
     `labels` (C,) are sorted, and every true label is one of them.
     """
     count = len(labels)
-    row, column = np.searchsorted(labels, truth), np.minimum(np.searchsorted(labels, predicted), count - 1)
+    row, column = (
+        np.searchsorted(labels, truth),
+        np.minimum(np.searchsorted(labels, predicted), count - 1),
+    )
     column = np.where(labels[column] == predicted, column, count)
-    return np.bincount(row * (count + 1) + column, minlength=count * (count + 1)).reshape(count, count + 1)
+    return np.bincount(row * (count + 1) + column, minlength=count * (count + 1)).reshape(
+        count, count + 1
+    )
 
 
-def transfer_labels(points: NDArray, labels: NDArray, targets: NDArray, max_distance: float = 0.1) -> NDArray[np.int64]:
-    """The label (M,) that each of `targets` (M, 3) takes from the nearest of labelled `points` (N, 3), all in world [m].
+def transfer_labels(
+    points: NDArray, labels: NDArray, targets: NDArray, max_distance: float = 0.1
+) -> NDArray[np.int64]:
+    """The label (M,) that each of `targets` (M, 3) takes from the nearest of labelled `points` (N,
+    3), all in world [m].
 
     -1 where none lies within `max_distance` [m]. Raises InputError for points that are not finite or not as many as labels.
     """
@@ -119,7 +161,11 @@ def transfer_labels(points: NDArray, labels: NDArray, targets: NDArray, max_dist
 def _group(scores: Collection[ClassScore]) -> GroupScore | None:
     if not scores:
         return None
-    return GroupScore(len(scores), float(np.mean([s.iou for s in scores])), float(np.mean([s.accuracy for s in scores])))
+    return GroupScore(
+        len(scores),
+        float(np.mean([s.iou for s in scores])),
+        float(np.mean([s.accuracy for s in scores])),
+    )
 
 
 def _labels(labels: NDArray, name: str) -> NDArray[np.int64]:
@@ -127,7 +173,9 @@ def _labels(labels: NDArray, name: str) -> NDArray[np.int64]:
     if labels.ndim == 2 and labels.shape[1] == 1:  # as a mesh carries them
         labels = labels[:, 0]
     if labels.ndim != 1 or not len(labels) or labels.dtype.kind not in "iufb":
-        raise InputError(f"segmentation: {name} must be (N,) whole numbers, got {labels.shape} {labels.dtype}")
+        raise InputError(
+            f"segmentation: {name} must be (N,) whole numbers, got {labels.shape} {labels.dtype}"
+        )
     whole = np.rint(labels.astype(np.float64))
     if not (np.isfinite(whole).all() and (np.abs(whole) < 2**53).all() and (whole == labels).all()):
         raise InputError(f"segmentation: {name} hold numbers that are not whole")
@@ -137,5 +185,7 @@ def _labels(labels: NDArray, name: str) -> NDArray[np.int64]:
 def _points(points: NDArray, name: str) -> NDArray[np.float64]:
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
-        raise InputError(f"segmentation: {name} must be (N, 3) finite numbers, at least one, got {points.shape}")
+        raise InputError(
+            f"segmentation: {name} must be (N, 3) finite numbers, at least one, got {points.shape}"
+        )
     return points

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..types import Mesh, PinholeCamera, check_rigid
 from ..rendering.raycaster import RayCaster, RayHits
+from ..types import Mesh, PinholeCamera, check_rigid
 
-STEEPEST = 8.0  # slope of depth, in depths of one pixel's width a pixel: about 80 degrees; beyond it a plane is not trusted
+# slope of depth, in depths of one pixel's width a pixel: about 80 degrees; beyond it a plane is not
+# trusted
+STEEPEST = 8.0
 
 
 @dataclass(frozen=True)
@@ -20,29 +22,38 @@ class Views:
 
     camera: PinholeCamera
     T_world_camera: NDArray[np.float64]  # (N, 4, 4)
-    depth_min: float = 0.1               # [m]
-    depth_max: float = 5.0               # [m]
+    depth_min: float = 0.1  # [m]
+    depth_max: float = 5.0  # [m]
 
     def __post_init__(self) -> None:
         poses = np.asarray(self.T_world_camera, np.float64)
         if poses.ndim != 3 or not len(poses):
-            raise InputError(f"views: T_world_camera must be (N, 4, 4) with at least one pose, got {poses.shape}")
+            raise InputError(
+                f"views: T_world_camera must be (N, 4, 4) with at least one pose, got {poses.shape}"
+            )
         poses = np.stack([check_rigid(T, f"views: pose {i}") for i, T in enumerate(poses)])
         object.__setattr__(self, "T_world_camera", poses)
         if not 0 < self.depth_min < self.depth_max:
-            raise InputError(f"views: need 0 < depth_min < depth_max, got {self.depth_min} and {self.depth_max}")
+            raise InputError(
+                f"views: need 0 < depth_min < depth_max, got {self.depth_min} and {self.depth_max}"
+            )
 
 
-def points_within_view(views: Views, mesh: Mesh, points: tuple[NDArray, ...], behind: tuple[float, ...],
-                       ) -> tuple[NDArray[np.bool_], ...]:
+def points_within_view(
+    views: Views,
+    mesh: Mesh,
+    points: tuple[NDArray, ...],
+    behind: tuple[float, ...],
+) -> tuple[NDArray[np.bool_], ...]:
     """For each set of points (N, 3) world [m]: which (N,) lie in the view of at least one camera.
 
-    In view means: inside the image, in the depth range, and no more than `behind` metres (one number a set) deeper than the
-    first surface of `mesh` on the same ray; a ray that hits nothing is free to the end of the range.
+    In view means: inside the image, in the depth range, and no more than `behind` metres (one
+    number a set) deeper than the first surface of `mesh` on the same ray; a ray that hits nothing
+    is free to the end of the range.
     """
     caster = RayCaster(mesh, "ground truth")
-    left = [np.asarray(p, np.float64) for p in points]      # not seen so far
-    rows = [np.arange(len(p)) for p in left]                # theirs
+    left = [np.asarray(p, np.float64) for p in points]  # not seen so far
+    rows = [np.arange(len(p)) for p in left]  # theirs
     seen = tuple(np.zeros(len(p), bool) for p in left)
     corners = caster.mesh.vertices[caster.mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -55,13 +66,21 @@ def points_within_view(views: Views, mesh: Mesh, points: tuple[NDArray, ...], be
     return seen
 
 
-def _in_view(views: Views, hits: RayHits, corner: NDArray, normals: NDArray, points: NDArray,
-             slack: float) -> NDArray[np.bool_]:
-    """Which points (N, 3) world [m] one camera has in view; `corner` and `normals` are the planes of the triangles."""
-    camera, eye, R_world_camera = views.camera, hits.T_world_camera[:3, 3], hits.T_world_camera[:3, :3]
+def _in_view(
+    views: Views, hits: RayHits, corner: NDArray, normals: NDArray, points: NDArray, slack: float
+) -> NDArray[np.bool_]:
+    """Which points (N, 3) world [m] one camera has in view; `corner` and `normals` are the planes
+    of the triangles.
+    """
+    camera, eye, R_world_camera = (
+        views.camera,
+        hits.T_world_camera[:3, 3],
+        hits.T_world_camera[:3, :3],
+    )
     inside = np.zeros(len(points), bool)
     z = points @ R_world_camera[:, 2] - eye @ R_world_camera[:, 2]
-    ahead = np.nonzero((z >= views.depth_min) & (z <= views.depth_max))[0]  # few of many points: the rest is done for these
+    # few of many points: the rest is done for these
+    ahead = np.nonzero((z >= views.depth_min) & (z <= views.depth_max))[0]
     to_point, z = points[ahead] - eye, z[ahead]
     u = np.rint(camera.fx * (to_point @ R_world_camera[:, 0]) / z + camera.cx).astype(int)
     v = np.rint(camera.fy * (to_point @ R_world_camera[:, 1]) / z + camera.cy).astype(int)
@@ -71,8 +90,13 @@ def _in_view(views: Views, hits: RayHits, corner: NDArray, normals: NDArray, poi
     triangle = hits.triangle[v, u]
     depth = np.where(triangle >= 0, hits.depth[v, u].astype(np.float64), 0.0)
     normal = normals[triangle]
-    with np.errstate(divide="ignore", invalid="ignore"):  # a plane that holds the ray: its depth at the pixel's centre counts
-        there = z * np.einsum("nd,nd->n", normal, corner[triangle] - eye) / np.einsum("nd,nd->n", normal, to_point)
+    # a plane that holds the ray: its depth at the pixel's centre counts
+    with np.errstate(divide="ignore", invalid="ignore"):
+        there = (
+            z
+            * np.einsum("nd,nd->n", normal, corner[triangle] - eye)
+            / np.einsum("nd,nd->n", normal, to_point)
+        )
     trust = STEEPEST * depth / min(camera.fx, camera.fy)
     surface = np.where(np.isfinite(there), np.clip(there, depth - trust, depth + trust), depth)
     inside[ahead] = (triangle < 0) | (z <= surface + slack)

@@ -44,7 +44,9 @@ def read_bytes(path: str | os.PathLike) -> bytes:
 
 
 def check_writable(folder: str | os.PathLike) -> Path:
-    """Create `folder` where needed and write a test file in it; raises FileError that says why it cannot hold results."""
+    """Create `folder` where needed and write a test file in it; raises FileError that says why it
+    cannot hold results.
+    """
     folder = Path(folder)
     probe = folder / f".{secrets.token_hex(4)}.tmp"
     try:
@@ -60,10 +62,12 @@ def check_writable(folder: str | os.PathLike) -> Path:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Give a temporary path in the folder of `path`; what was written there replaces `path` when the block ends well.
+    """Give a temporary path in the folder of `path`; what was written there replaces `path` when
+    the block ends well.
 
-    On any exception, Ctrl-C included, the temporary file is removed and an older file at `path` stays as it was.
-    An OSError of the block (disk full, no permission) becomes a FileError that names `path` and the reason.
+    On any exception, Ctrl-C included, the temporary file is removed and an older file at `path`
+    stays as it was. An OSError of the block (disk full, no permission) becomes a FileError that
+    names `path` and the reason.
     """
     path = Path(os.path.realpath(path))  # a link keeps pointing where it does
     if path.exists() and not path.is_file():
@@ -80,7 +84,8 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     except OSError as error:
         raise file_error("write", path, error) from error
     finally:
-        with suppress(OSError):  # it is gone when all went well, and was never there when the folder is none
+        # it is gone when all went well, and was never there when the folder is none
+        with suppress(OSError):
             temporary.unlink()
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FileError, InputError
-from .meshes import read_mesh
 from ..types import Mesh
+from .meshes import read_mesh
 
 SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")
 
@@ -16,12 +16,15 @@ SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")
 def read_any_mesh(path: str | Path) -> Mesh:
     """Read the triangles of a mesh file, parts of a scene in their places; colour only from PLY.
 
-    Raises FileError where the file is missing or damaged, InputError for a suffix that is not a mesh's.
+    Raises FileError where the file is missing or damaged, InputError for a suffix that is not a
+    mesh's.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise InputError(f"{path}: meshes are read from {', '.join(SUFFIXES)}, not from '{path.suffix}'")
+        raise InputError(
+            f"{path}: meshes are read from {', '.join(SUFFIXES)}, not from '{path.suffix}'"
+        )
     if not path.is_file():
         raise FileError(f"{path}: no such file")
     if suffix == ".ply":
@@ -32,11 +35,15 @@ def read_any_mesh(path: str | Path) -> Mesh:
         return _joined(trimesh.load_scene(path, process=False))
     except Exception as error:  # its readers raise whatever they stumble over
         reason = " ".join(str(error).split())[:200]
-        raise FileError(f"{path}: cannot be read as a mesh ({type(error).__name__}: {reason})") from None
+        raise FileError(
+            f"{path}: cannot be read as a mesh ({type(error).__name__}: {reason})"
+        ) from None
 
 
 def _joined(scene) -> Mesh:
-    """The triangles of a trimesh scene, in its own frame; trimesh would join the textures too, at gigabytes."""
+    """The triangles of a trimesh scene, in its own frame; trimesh would join the textures too, at
+    gigabytes.
+    """
     vertices, faces, count = [], [], 0
     for node in scene.graph.nodes_geometry:
         T_scene_part, name = scene.graph[node]

@@ -1,7 +1,9 @@
-"""What an image file says about itself before it is decoded: its kind, its size, and whether it is whole.
+"""What an image file says about itself before it is decoded: its kind, its size, and whether it is
+whole.
 
-A decoder allocates what the header asks for, so the header is judged first; and decoders differ in what they do with a cut
-or damaged file (some fill the rest with grey), so the file's own marks are checked: PNG checksums, JPEG's end marker.
+A decoder allocates what the header asks for, so the header is judged first; and decoders differ in
+what they do with a cut or damaged file (some fill the rest with grey), so the file's own marks are
+checked: PNG checksums, JPEG's end marker.
 """
 
 from __future__ import annotations
@@ -12,19 +14,25 @@ from dataclasses import dataclass
 
 from ..errors import FrameError
 
-MAX_PIXELS = 100_000_000  # three times an 8k image: more is a damaged or hostile header, not a frame
+# three times an 8k image: more is a damaged or hostile header, not a frame
+MAX_PIXELS = 100_000_000
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-JPEG_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF markers; the three are tables
+# SOF markers; the three are tables
+JPEG_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_START_OF_SCAN = 0xDA
 JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
-PGM_HEADER = re.compile(rb"P5(?:\s+#[^\n]*)*\s+(\d{1,9})(?:\s+#[^\n]*)*\s+(\d{1,9})(?:\s+#[^\n]*)*\s+(\d{1,5})\s")
+PGM_HEADER = re.compile(
+    rb"P5(?:\s+#[^\n]*)*\s+(\d{1,9})(?:\s+#[^\n]*)*\s+(\d{1,9})(?:\s+#[^\n]*)*\s+(\d{1,5})\s"
+)
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Kind ("PNG", "JPEG", "PGM") and size [pixels] as the header states them; the pixel data begin after `data_offset`."""
+    """Kind ("PNG", "JPEG", "PGM") and size [pixels] as the header states them; the pixel data begin
+    after `data_offset`.
+    """
 
     kind: str
     width: int
@@ -34,7 +42,9 @@ class ImageHeader:
 
 
 def read_header(data: bytes, where: str) -> ImageHeader:
-    """The header at the start of `data`; `where` names the file in a FrameError (not an image, cut, or absurdly large)."""
+    """The header at the start of `data`; `where` names the file in a FrameError (not an image, cut,
+    or absurdly large).
+    """
     if not data:
         raise FrameError(f"{where}: the file is empty")
     if data.startswith(PNG_SIGNATURE):
@@ -44,11 +54,15 @@ def read_header(data: bytes, where: str) -> ImageHeader:
     elif data.startswith(b"P5"):
         header = _pgm_header(data)
     else:
-        raise FrameError(f"{where}: not a PNG, JPEG or binary PGM image (it starts with {data[:8]!r})")
+        raise FrameError(
+            f"{where}: not a PNG, JPEG or binary PGM image (it starts with {data[:8]!r})"
+        )
     if header is None:
         raise FrameError(f"{where}: the image header is damaged or cut off")
     if header.width < 1 or header.height < 1 or header.width * header.height > MAX_PIXELS:
-        raise FrameError(f"{where}: the header says {header.width}x{header.height} pixels, refused (at most {MAX_PIXELS})")
+        raise FrameError(
+            f"{where}: the header says {header.width}x{header.height} pixels, refused (at most {MAX_PIXELS})"
+        )
     return header
 
 
@@ -63,19 +77,21 @@ def check_whole(data: bytes, header: ImageHeader, where: str) -> None:
 def _png_header(data: bytes) -> ImageHeader | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         return None
-    return ImageHeader("PNG", int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), 8)
+    return ImageHeader(
+        "PNG", int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), 8
+    )
 
 
 def _png_is_whole(data: bytes, header: ImageHeader) -> str | None:
     at, view = header.data_offset, memoryview(data)
     while at + 12 <= len(data):
-        length = int.from_bytes(data[at:at + 4], "big")
+        length = int.from_bytes(data[at : at + 4], "big")
         end = at + 12 + length  # length, type, payload, checksum
         if end > len(data):
             break
-        if zlib.crc32(view[at + 4:end - 4]) != int.from_bytes(data[end - 4:end], "big"):
+        if zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             return "damaged (a checksum does not match)"
-        if data[at + 4:at + 8] == b"IEND":
+        if data[at + 4 : at + 8] == b"IEND":
             return None
         at = end
     return f"cut off after {len(data)} bytes"
@@ -92,15 +108,19 @@ def _jpeg_header(data: bytes) -> ImageHeader | None:
             at += 2
             continue
         if marker in JPEG_START_OF_FRAME and at + 9 <= len(data):
-            size = int.from_bytes(data[at + 7:at + 9], "big"), int.from_bytes(data[at + 5:at + 7], "big")
+            size = (
+                int.from_bytes(data[at + 7 : at + 9], "big"),
+                int.from_bytes(data[at + 5 : at + 7], "big"),
+            )
         if marker == JPEG_START_OF_SCAN:
             return ImageHeader("JPEG", *size, at) if size else None
-        at += 2 + int.from_bytes(data[at + 2:at + 4], "big")
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return None
 
 
 def _jpeg_is_whole(data: bytes, header: ImageHeader) -> str | None:
-    # inside a scan 0xFF is always escaped, so the marker cannot occur by chance; an embedded thumbnail's lies before it
+    # inside a scan 0xFF is always escaped, so the marker cannot occur by chance; an embedded
+    # thumbnail's lies before it
     return None if data.rfind(JPEG_END) > header.data_offset else f"cut off after {len(data)} bytes"
 
 
@@ -109,8 +129,14 @@ def _pgm_header(data: bytes) -> ImageHeader | None:
     if not match:
         return None
     width, height, maximum = map(int, match.groups())
-    return ImageHeader("PGM", width, height, match.end(), width * height * (2 if maximum > 255 else 1))
+    return ImageHeader(
+        "PGM", width, height, match.end(), width * height * (2 if maximum > 255 else 1)
+    )
 
 
 def _pgm_is_whole(data: bytes, header: ImageHeader) -> str | None:
-    return None if len(data) >= header.data_offset + header.data_bytes else f"cut off after {len(data)} bytes"
+    return (
+        None
+        if len(data) >= header.data_offset + header.data_bytes
+        else f"cut off after {len(data)} bytes"
+    )

@@ -1,6 +1,8 @@
-"""Colour and depth image files -> RGB bytes and metres; every failure is a FrameError that names the file.
+"""Colour and depth image files -> RGB bytes and metres; every failure is a FrameError that names
+the file.
 
-Files are read unchanged and their type checked: with OpenCV's default flag a 16-bit depth image becomes 8-bit silently.
+Files are read unchanged and their type checked: with OpenCV's default flag a 16-bit depth image
+becomes 8-bit silently.
 """
 
 from __future__ import annotations
@@ -16,12 +18,14 @@ from ..errors import FrameError, SizeMismatch
 from .image_headers import MAX_PIXELS, check_whole, read_header
 
 INVALID_DEPTH = (0, 65535)  # no reading; 65535 is also what 16 bits saturate at
-SAME_ASPECT = 0.01          # relative difference of width/height up to which colour is resized to depth
-HEADER_BYTES = 4096         # enough for the size in a PNG or PGM header
+SAME_ASPECT = 0.01  # relative difference of width/height up to which colour is resized to depth
+HEADER_BYTES = 4096  # enough for the size in a PNG or PGM header
 
 
 def read_color(path: Path, *, drop_alpha: bool = False) -> NDArray[np.uint8]:
-    """The 8-bit colour image at `path` as (H, W, 3) RGB; an alpha channel is an error unless `drop_alpha`."""
+    """The 8-bit colour image at `path` as (H, W, 3) RGB; an alpha channel is an error unless
+    `drop_alpha`.
+    """
     return decode_color(_read_bytes(path), str(path), drop_alpha=drop_alpha)
 
 
@@ -29,24 +33,32 @@ def decode_color(data: bytes, where: str, *, drop_alpha: bool = False) -> NDArra
     """The bytes of a PNG or JPEG file as (H, W, 3) RGB; `where` names them in messages."""
     image = _decode(data, where)
     if image.dtype != np.uint8:
-        raise FrameError(f"{where}: colour must be 8 bits a channel, got {image.dtype}; is this a depth image?")
+        raise FrameError(
+            f"{where}: colour must be 8 bits a channel, got {image.dtype}; is this a depth image?"
+        )
     channels = 1 if image.ndim == 2 else image.shape[2]
     if channels == 4 and drop_alpha:
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGB)
     if channels != 3:
-        advice = "pass drop_alpha=True to ignore the fourth" if channels == 4 else "convert it to RGB"
+        advice = (
+            "pass drop_alpha=True to ignore the fourth" if channels == 4 else "convert it to RGB"
+        )
         raise FrameError(f"{where}: colour must have 3 channels, got {channels}; {advice}")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def read_depth(path: Path, depth_scale: float, invalid: Collection[int] = INVALID_DEPTH) -> NDArray[np.float32]:
+def read_depth(
+    path: Path, depth_scale: float, invalid: Collection[int] = INVALID_DEPTH
+) -> NDArray[np.float32]:
     """The depth image at `path` as (H, W) metres, 0 where there is no reading.
 
-    PNG and PGM hold 16-bit integers, `depth_scale` units a metre, `invalid` among them. NPY holds such integers, or floats,
-    which are metres as they stand.
+    PNG and PGM hold 16-bit integers, `depth_scale` units a metre, `invalid` among them. NPY holds
+    such integers, or floats, which are metres as they stand.
     """
     if path.suffix.lower() != ".npy":
-        return depth_to_metres(_decode(_read_bytes(path), str(path)), str(path), depth_scale, invalid)
+        return depth_to_metres(
+            _decode(_read_bytes(path), str(path)), str(path), depth_scale, invalid
+        )
     array = np.array(_open_npy(path))
     if array.ndim == 2 and np.issubdtype(array.dtype, np.floating):
         depth = array.astype(np.float32)
@@ -54,12 +66,16 @@ def read_depth(path: Path, depth_scale: float, invalid: Collection[int] = INVALI
     return depth_to_metres(array, str(path), depth_scale, invalid)
 
 
-def depth_to_metres(raw: NDArray, where: str, depth_scale: float, invalid: Collection[int]) -> NDArray[np.float32]:
+def depth_to_metres(
+    raw: NDArray, where: str, depth_scale: float, invalid: Collection[int]
+) -> NDArray[np.float32]:
     """(H, W) uint16 sensor units -> (H, W) float32 metres, 0 where the unit is one of `invalid`."""
     if raw.ndim != 2 or raw.dtype != np.uint16:
         channels = 1 if raw.ndim == 2 else raw.shape[-1]
-        raise FrameError(f"{where}: depth must be one channel of 16 bits, got {channels} of {raw.dtype}; "
-                         "an 8-bit or coloured picture of depth holds no distances")
+        raise FrameError(
+            f"{where}: depth must be one channel of 16 bits, got {channels} of {raw.dtype}; "
+            "an 8-bit or coloured picture of depth holds no distances"
+        )
     depth = raw.astype(np.float32)
     depth /= np.float32(depth_scale)
     for value in invalid:
@@ -73,17 +89,24 @@ def read_infrared(path: Path) -> NDArray[np.float32]:
     image = _decode(_read_bytes(path), str(path))
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise FrameError(f"{path}: infrared must be one channel of 8 or 16 bits, got {channels} of {image.dtype}; convert it "
-                         "to grey values")
-    return image.astype(np.float32) * np.float32(257 if image.dtype == np.uint8 else 1)  # 255 * 257 = 65535
+        raise FrameError(
+            f"{path}: infrared must be one channel of 8 or 16 bits, got {channels} of {image.dtype}; convert it "
+            "to grey values"
+        )
+    # 255 * 257 = 65535
+    return image.astype(np.float32) * np.float32(257 if image.dtype == np.uint8 else 1)
 
 
 def read_values(path: Path) -> NDArray[np.float32]:
-    """The numbers at `path` as (H, W, c) float32: a `.npy` array as it is, a picture of 8 or 16 bits (RGB) as [0, 1]."""
+    """The numbers at `path` as (H, W, c) float32: a `.npy` array as it is, a picture of 8 or 16
+    bits (RGB) as [0, 1].
+    """
     if path.suffix.lower() == ".npy":
         array = np.array(_open_npy(path))
         if array.ndim not in (2, 3) or array.dtype.kind not in "fiub":
-            raise FrameError(f"{path}: must hold (H, W) or (H, W, c) numbers, got {array.shape} {array.dtype}")
+            raise FrameError(
+                f"{path}: must hold (H, W) or (H, W, c) numbers, got {array.shape} {array.dtype}"
+            )
         return np.ascontiguousarray(array.reshape(*array.shape[:2], -1), np.float32)
     image = _decode(_read_bytes(path), str(path))
     if image.dtype not in (np.uint8, np.uint16):
@@ -105,20 +128,34 @@ def depth_file_size(path: Path) -> tuple[int, int]:
     return header.width, header.height
 
 
-def resize_color(color: NDArray[np.uint8], width: int, height: int, where: str) -> NDArray[np.uint8]:
-    """Colour resampled to the depth image's size, or SizeMismatch where the shapes differ by more than 1 %."""
+def resize_color(
+    color: NDArray[np.uint8], width: int, height: int, where: str
+) -> NDArray[np.uint8]:
+    """Colour resampled to the depth image's size, or SizeMismatch where the shapes differ by more
+    than 1 %.
+    """
     return resize_image(color, width, height, where, "colour")
 
 
-def resize_image(image: NDArray, width: int, height: int, where: str, what: str = "the image") -> NDArray:
-    """An image (H, W[, c]) resampled to the depth image's size, or SizeMismatch where the shapes differ by more than 1 %."""
+def resize_image(
+    image: NDArray, width: int, height: int, where: str, what: str = "the image"
+) -> NDArray:
+    """An image (H, W[, c]) resampled to the depth image's size, or SizeMismatch where the shapes
+    differ by more than 1 %.
+    """
     image_height, image_width = image.shape[:2]
     if (image_width, image_height) == (width, height):
         return image
     if abs(image_width * height / (image_height * width) - 1) > SAME_ASPECT:
-        raise SizeMismatch(f"{where}: {what} is {image_width}x{image_height} but depth is {width}x{height}, another shape; "
-                           f"register {what} to depth first")
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if width < image_width else cv2.INTER_LINEAR)
+        raise SizeMismatch(
+            f"{where}: {what} is {image_width}x{image_height} but depth is {width}x{height}, another shape; "
+            f"register {what} to depth first"
+        )
+    return cv2.resize(
+        image,
+        (width, height),
+        interpolation=cv2.INTER_AREA if width < image_width else cv2.INTER_LINEAR,
+    )
 
 
 def _read_bytes(path: Path, count: int = -1) -> bytes:
@@ -128,7 +165,9 @@ def _read_bytes(path: Path, count: int = -1) -> bytes:
     except FileNotFoundError:
         raise FrameError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in a name that a list of images gave
-        raise FrameError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+        raise FrameError(
+            f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        ) from error
 
 
 def _decode(data: bytes, where: str) -> NDArray:
@@ -137,14 +176,18 @@ def _decode(data: bytes, where: str) -> NDArray:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise FrameError(f"{where}: the {header.kind} file cannot be decoded ({error.err})") from error
+        raise FrameError(
+            f"{where}: the {header.kind} file cannot be decoded ({error.err})"
+        ) from error
     if image is None:
         raise FrameError(f"{where}: the {header.kind} file is damaged and cannot be decoded")
     return image
 
 
 def _open_npy(path: Path) -> NDArray:
-    """The array in `path`, mapped and not yet read: a header that promises more than the file holds is refused here."""
+    """The array in `path`, mapped and not yet read: a header that promises more than the file holds
+    is refused here.
+    """
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError:

@@ -20,24 +20,30 @@ SUFFIXES = (".ply", ".txt", ".npy")
 class LabelFile:
     """One label a point or vertex, and where they are if the file says so."""
 
-    labels: NDArray[np.float64]              # (N,) whole numbers, if the file is right
+    labels: NDArray[np.float64]  # (N,) whole numbers, if the file is right
     points: NDArray[np.float32] | None = None  # (N, 3) world [m]
 
 
 def read_labels(path: str | Path, attribute: str = "label") -> LabelFile:
-    """Read labels from a PLY file's vertex property `attribute`, a .txt with one number a line, or a .npy array.
+    """Read labels from a PLY file's vertex property `attribute`, a .txt with one number a line, or
+    a .npy array.
 
-    Raises FileError where the file is missing or damaged, InputError for another suffix or a PLY without that property.
+    Raises FileError where the file is missing or damaged, InputError for another suffix or a PLY
+    without that property.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".ply":
         mesh = read_mesh(path)
         if attribute not in mesh.attributes:
-            raise InputError(f"{path}: has no vertex property '{attribute}', only {', '.join(mesh.attributes) or 'positions'}")
+            raise InputError(
+                f"{path}: has no vertex property '{attribute}', only {', '.join(mesh.attributes) or 'positions'}"
+            )
         values = mesh.attributes[attribute]
         if values.shape[1] != 1:
-            raise InputError(f"{path}: property '{attribute}' has {values.shape[1]} columns; a label is one number")
+            raise InputError(
+                f"{path}: property '{attribute}' has {values.shape[1]} columns; a label is one number"
+            )
         return LabelFile(values[:, 0].astype(np.float64), mesh.vertices)
     if suffix == ".txt":
         return LabelFile(_parse_text(path))
@@ -48,22 +54,36 @@ def read_labels(path: str | Path, attribute: str = "label") -> LabelFile:
             if isinstance(error, FileError):
                 raise
             raise FileError(f"{path}: not an array that NumPy wrote, or a damaged file") from None
-        if not isinstance(values, np.ndarray) or values.dtype.kind not in "iufb" or values.squeeze().ndim != 1:
-            raise InputError(f"{path}: expected one number a point, got {getattr(values, 'shape', 'an archive')} "
-                             f"{getattr(values, 'dtype', '')}".rstrip())
+        if (
+            not isinstance(values, np.ndarray)
+            or values.dtype.kind not in "iufb"
+            or values.squeeze().ndim != 1
+        ):
+            raise InputError(
+                f"{path}: expected one number a point, got {getattr(values, 'shape', 'an archive')} "
+                f"{getattr(values, 'dtype', '')}".rstrip()
+            )
         return LabelFile(values.squeeze().astype(np.float64))
-    raise InputError(f"{path}: labels are read from {', '.join(SUFFIXES)}, not from '{path.suffix}'")
+    raise InputError(
+        f"{path}: labels are read from {', '.join(SUFFIXES)}, not from '{path.suffix}'"
+    )
 
 
 def read_class_names(path: str | Path) -> dict[int, str]:
-    """Read lines `label name`, such as `3 kitchen table`; empty lines and # comments are fine. Raises FileError."""
+    """Read lines `label name`, such as `3 kitchen table`; empty lines and # comments are fine.
+    Raises FileError.
+    """
     names: dict[int, str] = {}
     for number, line in _lines(Path(path)):
         label, _, name = line.partition(" ")
         if not label.lstrip("-").isdecimal() or not name.strip():
-            raise FileError(f"{path}, line {number}: expected 'label name', such as '3 chair', got '{line[:80]}'")
+            raise FileError(
+                f"{path}, line {number}: expected 'label name', such as '3 chair', got '{line[:80]}'"
+            )
         if int(label) in names:
-            raise FileError(f"{path}, line {number}: label {label} has a name already, '{names[int(label)]}'")
+            raise FileError(
+                f"{path}, line {number}: label {label} has a name already, '{names[int(label)]}'"
+            )
         names[int(label)] = name.strip()
     if not names:
         raise FileError(f"{path}: holds no names; expected lines 'label name', such as '3 chair'")
@@ -76,7 +96,9 @@ def _parse_text(path: Path) -> NDArray[np.float64]:
         try:
             values.append(float(line))
         except ValueError:
-            raise FileError(f"{path}, line {number}: expected one number, got '{line[:80]}'") from None
+            raise FileError(
+                f"{path}, line {number}: expected one number, got '{line[:80]}'"
+            ) from None
     if not values:
         raise FileError(f"{path}: holds no labels; expected one number a line")
     return np.array(values)
@@ -88,5 +110,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FileError(f"{path}: not a text file") from None
-    stripped = ((number, " ".join(line.split())) for number, line in enumerate(text.splitlines(), start=1))
+    stripped = (
+        (number, " ".join(line.split())) for number, line in enumerate(text.splitlines(), start=1)
+    )
     return [(number, line) for number, line in stripped if line and not line.startswith("#")]

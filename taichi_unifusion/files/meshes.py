@@ -16,16 +16,21 @@ MESH_SUFFIXES = (".ply", ".glb", ".obj")
 def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
     """Write `mesh` atomically; the suffix of `path` chooses PLY (binary), GLB or OBJ.
 
-    Attribute "color" becomes 8-bit RGB. PLY holds all other attributes as float properties, GLB and OBJ leave them out.
-    Raises InputError for another suffix, bad face indices or an empty GLB/OBJ, FileError where the file cannot be written.
+    Attribute "color" becomes 8-bit RGB. PLY holds all other attributes as float properties, GLB and
+    OBJ leave them out. Raises InputError for another suffix, bad face indices or an empty GLB/OBJ,
+    FileError where the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise InputError(f"{path}: a mesh is written as {', '.join(MESH_SUFFIXES)}, not as '{path.suffix}'")
+        raise InputError(
+            f"{path}: a mesh is written as {', '.join(MESH_SUFFIXES)}, not as '{path.suffix}'"
+        )
     if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
-        raise InputError(f"{path}: the faces name vertices {mesh.faces.min()}..{mesh.faces.max()}, "
-                         f"but the mesh has {len(mesh.vertices)}")
+        raise InputError(
+            f"{path}: the faces name vertices {mesh.faces.min()}..{mesh.faces.max()}, "
+            f"but the mesh has {len(mesh.vertices)}"
+        )
     if suffix == ".ply":
         with atomic_write(path) as temporary, open(temporary, "wb") as file:
             write_ply(file, mesh)
@@ -36,7 +41,9 @@ def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
 
 
 def read_mesh(path: str | os.PathLike) -> Mesh:
-    """Read a PLY mesh, ours or another program's; raises FileError where it is missing, truncated or inconsistent."""
+    """Read a PLY mesh, ours or another program's; raises FileError where it is missing, truncated
+    or inconsistent.
+    """
     path = Path(path)
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path}: meshes are read from .ply, not from '{path.suffix}'")
@@ -46,14 +53,23 @@ def read_mesh(path: str | os.PathLike) -> Mesh:
 def _encode_with_trimesh(path: Path, mesh: Mesh) -> bytes:
     """The bytes of a GLB or OBJ file, vertices and faces in their order."""
     if not len(mesh.faces):
-        raise InputError(f"{path}: the mesh is empty, which {path.suffix} cannot hold; write a .ply")
+        raise InputError(
+            f"{path}: the mesh is empty, which {path.suffix} cannot hold; write a .ply"
+        )
     try:
         import trimesh
     except ImportError:
-        raise MissingDependency(f"{path}: writing {path.suffix} needs trimesh: pip install trimesh") from None
+        raise MissingDependency(
+            f"{path}: writing {path.suffix} needs trimesh: pip install trimesh"
+        ) from None
     color = mesh.attributes.get("color")
     has_normals = mesh.normals is not None
-    exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False,
-                               vertex_colors=None if color is None else color_to_uint8(color))
+    exported = trimesh.Trimesh(
+        mesh.vertices,
+        mesh.faces,
+        vertex_normals=mesh.normals,
+        process=False,
+        vertex_colors=None if color is None else color_to_uint8(color),
+    )
     content = exported.export(file_type=path.suffix.lower()[1:], include_normals=has_normals)
     return content.encode() if isinstance(content, str) else content

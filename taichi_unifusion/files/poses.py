@@ -1,7 +1,9 @@
-"""Camera poses as text: one matrix a file, one matrix a row, or TUM rows `timestamp tx ty tz qx qy qz qw`.
+"""Camera poses as text: one matrix a file, one matrix a row, or TUM rows `timestamp tx ty tz qx qy
+qz qw`.
 
-A pose that cannot be used (missing, wrong count of numbers, quaternion far from unit length) is kept with the reason, so that
-it costs its own frame only; a file that cannot be read as what it should be is a DatasetError with the line.
+A pose that cannot be used (missing, wrong count of numbers, quaternion far from unit length) is
+kept with the reason, so that it costs its own frame only; a file that cannot be read as what it
+should be is a DatasetError with the line.
 """
 
 from __future__ import annotations
@@ -24,9 +26,9 @@ UNIT_TOLERANCE = 1e-3  # of a quaternion's length: files of four digits pass
 class Pose:
     """A pose as found in a file: the matrix, not yet known to be rigid, or why there is none."""
 
-    source: str                                        # file and line, for messages
+    source: str  # file and line, for messages
     T_world_camera: NDArray[np.float64] | None = None  # (4, 4)
-    problem: str = ""                                  # why T_world_camera is None
+    problem: str = ""  # why T_world_camera is None
 
     def checked(self) -> NDArray[np.float64]:
         """T_world_camera as a rigid transform, or PoseError naming the source."""
@@ -36,7 +38,9 @@ class Pose:
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """(line number from 1, text) of every line that is neither empty nor a # comment; BOM and CRLF are accepted."""
+    """(line number from 1, text) of every line that is neither empty nor a # comment; BOM and CRLF
+    are accepted.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -44,7 +48,9 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: not a text file") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise DatasetError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+        raise DatasetError(
+            f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        ) from error
     for number, line in enumerate(text.split("\n"), 1):
         line = line.strip()
         if line and not line.startswith("#"):
@@ -80,7 +86,10 @@ def read_matrix_file(path: Path) -> Pose:
 
 def read_matrix_rows(path: Path) -> list[Pose]:
     """One row-major 4x4 matrix a row."""
-    return [matrix_from_row(split_row(line), f"{path} line {number}") for number, line in read_lines(path)]
+    return [
+        matrix_from_row(split_row(line), f"{path} line {number}")
+        for number, line in read_lines(path)
+    ]
 
 
 def matrix_from_row(words: list[str], where: str) -> Pose:
@@ -104,8 +113,11 @@ class TumRow:
         x, y, z, *quaternion = self.numbers
         length = math.hypot(*quaternion)
         if not abs(length - 1) <= UNIT_TOLERANCE:
-            return Pose(self.source, problem=f"the quaternion's length is {length:.4f}, not 1; are the columns "
-                                             "tx ty tz qx qy qz qw?")
+            return Pose(
+                self.source,
+                problem=f"the quaternion's length is {length:.4f}, not 1; are the columns "
+                "tx ty tz qx qy qz qw?",
+            )
         T = np.eye(4)
         T[:3, :3] = rotation_from_quaternion(np.array(quaternion) / length)
         T[:3, 3] = x, y, z
@@ -124,7 +136,9 @@ def read_tum_rows(path: Path) -> list[TumRow]:
 def tum_row(words: list[str], where: str) -> TumRow:
     """The row from its words, or DatasetError if they are not 8 or not numbers."""
     if len(words) != 8:
-        raise DatasetError(f"{where}: expected 8 columns (timestamp tx ty tz qx qy qz qw), found {len(words)}")
+        raise DatasetError(
+            f"{where}: expected 8 columns (timestamp tx ty tz qx qy qz qw), found {len(words)}"
+        )
     return TumRow(where, words[0], finite_or_none(words[0]), tuple(parse_numbers(words[1:], where)))
 
 

@@ -1,4 +1,5 @@
-"""Rigid motions: exponential, logarithm and adjoint of SE(3), twists in the order translation, rotation.
+"""Rigid motions: exponential, logarithm and adjoint of SE(3), twists in the order translation,
+rotation.
 
 All take one or many: (..., 4, 4) motions, (..., 6) twists.
 """
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SMALL_ANGLE = 1e-4  # [rad] below it the first terms of a series are exact to float64
-HALF_TURN = 1e-6    # of the sine of the angle: above it the axis is read off R - R^T
+HALF_TURN = 1e-6  # of the sine of the angle: above it the axis is read off R - R^T
 
 
 def hat(v: NDArray) -> NDArray[np.float64]:
@@ -39,7 +40,10 @@ def exp(xi: NDArray) -> NDArray[np.float64]:
 def log(T: NDArray) -> NDArray[np.float64]:
     """The twist whose exponential is T, with a rotation of at most half a turn."""
     R = T[..., :3, :3]
-    axis = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    axis = 0.5 * np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]],
+        axis=-1,
+    )
     sine = np.linalg.norm(axis, axis=-1)[..., None]
     cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1)[..., None] - 1)
     angle = np.arctan2(sine, cosine)
@@ -47,7 +51,11 @@ def log(T: NDArray) -> NDArray[np.float64]:
     longest = np.argmax(np.einsum("...ii->...i", outer), axis=-1)[..., None, None]
     column = np.take_along_axis(outer, longest, axis=-1)[..., 0]
     half = angle * column / np.maximum(np.linalg.norm(column, axis=-1, keepdims=True), SMALL_ANGLE)
-    w = np.where(sine > HALF_TURN, axis * (angle / np.maximum(sine, HALF_TURN)), np.where(cosine > 0, axis, half))
+    w = np.where(
+        sine > HALF_TURN,
+        axis * (angle / np.maximum(sine, HALF_TURN)),
+        np.where(cosine > 0, axis, half),
+    )
     angle = angle[..., None]
     small, safe = angle < SMALL_ANGLE, np.maximum(angle, SMALL_ANGLE)
     d = np.where(small, 1 / 12 + angle**2 / 720, (1 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
@@ -67,7 +75,9 @@ def inverse(T: NDArray) -> NDArray[np.float64]:
 
 
 def adjoint(T: NDArray) -> NDArray[np.float64]:
-    """(..., 6, 6) matrices that carry a twist in b to a, of T_a_b: T exp(xi) = exp(adjoint(T) xi) T."""
+    """(..., 6, 6) matrices that carry a twist in b to a, of T_a_b: T exp(xi) = exp(adjoint(T) xi)
+    T.
+    """
     A = np.zeros((*T.shape[:-2], 6, 6))
     A[..., :3, :3] = A[..., 3:, 3:] = T[..., :3, :3]
     A[..., :3, 3:] = hat(T[..., :3, 3]) @ T[..., :3, :3]
@@ -75,7 +85,9 @@ def adjoint(T: NDArray) -> NDArray[np.float64]:
 
 
 def normalized(T: NDArray) -> NDArray[np.float64]:
-    """T with the rotation nearest to its own. `inverse` relies on it: errors of long products would grow exponentially."""
+    """T with the rotation nearest to its own. `inverse` relies on it: errors of long products would
+    grow exponentially.
+    """
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     rigid = np.array(T, np.float64)
     rigid[..., :3, :3] = U @ Vt

@@ -10,10 +10,13 @@ from ..errors import InputError
 LONGEST_DIFFERENCE = 1.0  # [s]; beyond it pairs mean nothing and their number grows without bound
 
 
-def associate(a: NDArray[np.float64], b: NDArray[np.float64], max_difference: float) -> NDArray[np.int64]:
+def associate(
+    a: NDArray[np.float64], b: NDArray[np.float64], max_difference: float
+) -> NDArray[np.int64]:
     """(P, 2) index pairs into the sorted time stamps a and b [s], in the order of a.
 
-    Of all pairs within `max_difference` the closest is taken first, and each stamp is used once, as TUM's benchmark does.
+    Of all pairs within `max_difference` the closest is taken first, and each stamp is used once, as
+    TUM's benchmark does.
     """
     check_max_difference(max_difference)
     first = np.searchsorted(b, a - max_difference, side="left")
@@ -21,7 +24,8 @@ def associate(a: NDArray[np.float64], b: NDArray[np.float64], max_difference: fl
     count = np.maximum(last - first, 0)
     i = np.repeat(np.arange(len(a)), count)
     j = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - first, count)
-    order = np.argsort(np.abs(a[i] - b[j]), kind="stable")  # stable: equal differences pair the earlier stamps
+    # stable: equal differences pair the earlier stamps
+    order = np.argsort(np.abs(a[i] - b[j]), kind="stable")
     free_a, free_b = np.ones(len(a), bool), np.ones(len(b), bool)
     pairs = []
     for k in order:
@@ -42,4 +46,6 @@ def nearest(stamps: NDArray[np.float64], query: NDArray[np.float64]) -> NDArray[
 def check_max_difference(max_difference: float) -> None:
     """Raise InputError unless 0 < max_difference <= 1 s."""
     if not 0 < max_difference <= LONGEST_DIFFERENCE:
-        raise InputError(f"max_difference: must be above 0 and at most {LONGEST_DIFFERENCE} s, got {max_difference}")
+        raise InputError(
+            f"max_difference: must be above 0 and at most {LONGEST_DIFFERENCE} s, got {max_difference}"
+        )

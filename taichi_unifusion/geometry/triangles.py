@@ -1,4 +1,6 @@
-"""Triangle meshes as evaluation takes them: checked, sampled evenly, and how far points lie from their surface."""
+"""Triangle meshes as evaluation takes them: checked, sampled evenly, and how far points lie from
+their surface.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +10,32 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..types import Mesh
 
-PIECE_M = 0.04          # [m] triangles are cut into pieces of at most this edge, to find the nearest ones by their centres
+# [m] triangles are cut into pieces of at most this edge, to find the nearest ones by their centres
+PIECE_M = 0.04
 MAX_PIECES = 2_000_000  # 0.3 GB of search tree; of a larger surface the pieces are larger
-CANDIDATES = (24, 96)   # pieces looked at for a point; the second where the first leave a doubt
-EXACT_M = 0.1           # [m] beyond it a doubt is left: the distance is at most the radius of a piece too long
-POINT_CHUNK = 5_000     # points measured at once: some 150 MB of intermediate numbers at most
+CANDIDATES = (24, 96)  # pieces looked at for a point; the second where the first leave a doubt
+# [m] beyond it a doubt is left: the distance is at most the radius of a piece too long
+EXACT_M = 0.1
+POINT_CHUNK = 5_000  # points measured at once: some 150 MB of intermediate numbers at most
 
 
 def check_mesh(mesh: Mesh, name: str) -> Mesh:
-    """The mesh with arrays as kernels take them; raises InputError where it is empty, not finite or inconsistent.
+    """The mesh with arrays as kernels take them; raises InputError where it is empty, not finite or
+    inconsistent.
 
     `name` says which mesh it is, in messages.
     """
     vertices = np.ascontiguousarray(mesh.vertices, np.float32)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
     if not len(faces):
-        raise InputError(f"{name}: has no triangles" + (f", only {len(vertices)} points" if len(vertices) else ""))
+        raise InputError(
+            f"{name}: has no triangles"
+            + (f", only {len(vertices)} points" if len(vertices) else "")
+        )
     if not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise InputError(f"{name}: its triangles name vertices {faces.min()}..{faces.max()}, but it has {len(vertices)}")
+        raise InputError(
+            f"{name}: its triangles name vertices {faces.min()}..{faces.max()}, but it has {len(vertices)}"
+        )
     bad = int((~np.isfinite(vertices).all(axis=1)).sum())
     if bad:
         raise InputError(f"{name}: {bad} of {len(vertices)} vertices are not finite numbers")
@@ -37,7 +47,9 @@ def check_mesh(mesh: Mesh, name: str) -> Mesh:
 def triangle_areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
     """Areas (F,) [m^2]."""
     corners = vertices[faces].astype(np.float64)
-    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return 0.5 * np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
 
 
 def transformed(mesh: Mesh, T_b_a: NDArray) -> Mesh:
@@ -49,12 +61,14 @@ def transformed(mesh: Mesh, T_b_a: NDArray) -> Mesh:
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """`count` points (N, 3) drawn evenly over the area of a checked mesh.
 
-    Stratified along the list of triangles: each of `count` equal shares of the area gives one point, so that the sample varies
-    less than independent draws would.
+    Stratified along the list of triangles: each of `count` equal shares of the area gives one
+    point, so that the sample varies less than independent draws would.
     """
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     total = np.cumsum(triangle_areas(mesh.vertices, mesh.faces))
-    picked = np.searchsorted(total, (np.arange(count) + rng.random(count)) * (total[-1] / count), side="right")
+    picked = np.searchsorted(
+        total, (np.arange(count) + rng.random(count)) * (total[-1] / count), side="right"
+    )
     a, b, c = corners[np.minimum(picked, len(corners) - 1)].swapaxes(0, 1)
     root, share = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
     return (1 - root) * a + root * (1 - share) * b + root * share * c
@@ -63,8 +77,9 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[
 class SurfaceDistance:
     """Distances from points to the surface of a checked mesh.
 
-    A point is measured exactly against the triangles whose pieces have the nearest centres. Within 10 cm no triangle that could
-    be nearer is left out, unless more than 96 pieces crowd there; farther off a distance may come out millimetres too long.
+    A point is measured exactly against the triangles whose pieces have the nearest centres. Within
+    10 cm no triangle that could be nearer is left out, unless more than 96 pieces crowd there;
+    farther off a distance may come out millimetres too long.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -78,29 +93,50 @@ class SurfaceDistance:
         """Distances (N,) [m] of points (N, 3)."""
         points, distances = np.asarray(points, np.float64), np.empty(len(points))
         for start in range(0, len(points), POINT_CHUNK):
-            part, left = points[start:start + POINT_CHUNK], np.arange(min(POINT_CHUNK, len(points) - start))
+            part, left = (
+                points[start : start + POINT_CHUNK],
+                np.arange(min(POINT_CHUNK, len(points) - start)),
+            )
             for candidates in CANDIDATES:
                 measured, horizon = self._measure(part[left], min(candidates, self.tree.n))
                 distances[start + left] = measured
-                in_doubt = measured + self.radius > horizon  # a piece beyond the horizon may reach nearer than was measured
+                # a piece beyond the horizon may reach nearer than was measured
+                in_doubt = measured + self.radius > horizon
                 left = left[in_doubt & (measured < EXACT_M)]
                 if not len(left) or candidates >= self.tree.n:
                     break
         return distances
 
-    def _measure(self, points: NDArray, candidates: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distances (N,) to the triangles of so many nearest pieces, and how far the centre of the last of these lies."""
-        reach, pieces = (found.reshape(len(points), candidates) for found in self.tree.query(points, k=candidates))
+    def _measure(
+        self, points: NDArray, candidates: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Distances (N,) to the triangles of so many nearest pieces, and how far the centre of the
+        last of these lies.
+        """
+        reach, pieces = (
+            found.reshape(len(points), candidates)
+            for found in self.tree.query(points, k=candidates)
+        )
         triangles = np.sort(self.owner[pieces], axis=1)
         row, column = np.nonzero(np.diff(triangles, axis=1, prepend=-1))  # each triangle once
         squared = squared_distance_to_triangles(points[row], self.corners[triangles[row, column]])
-        return np.sqrt(np.minimum.reduceat(squared, np.searchsorted(row, np.arange(len(points))))), reach[:, -1]
+        return np.sqrt(
+            np.minimum.reduceat(squared, np.searchsorted(row, np.arange(len(points))))
+        ), reach[:, -1]
 
 
 def _pieces(corners: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64], float]:
-    """Centres (P, 3) of the pieces of triangles, cut in half until short, the triangle (P,) of each, and the largest radius."""
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    edge = max(PIECE_M, 4 * np.sqrt(area / MAX_PIECES))  # halving leaves pieces of a sixteenth of its square on average
+    """Centres (P, 3) of the pieces of triangles, cut in half until short, the triangle (P,) of
+    each, and the largest radius.
+    """
+    area = (
+        0.5
+        * np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        ).sum()
+    )
+    # halving leaves pieces of a sixteenth of its square on average
+    edge = max(PIECE_M, 4 * np.sqrt(area / MAX_PIECES))
     centers, owners, radius, owner = [], [], 0.0, np.arange(len(corners))
     while len(corners):
         along = corners[:, [1, 2, 0]] - corners  # the edges from corner k to k + 1
@@ -109,17 +145,23 @@ def _pieces(corners: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64], f
         center = corners[whole].mean(axis=1)
         centers.append(center)
         owners.append(owner[whole])
-        radius = max(radius, np.linalg.norm(corners[whole] - center[:, None], axis=2).max(initial=0.0))
+        radius = max(
+            radius, np.linalg.norm(corners[whole] - center[:, None], axis=2).max(initial=0.0)
+        )
         corners, owner, first = corners[~whole], owner[~whole], squared[~whole].argmax(axis=1)
         a, b, c = (corners[np.arange(len(corners)), (first + k) % 3] for k in range(3))
         middle = (a + b) / 2
-        corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        corners = np.concatenate(
+            [np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)]
+        )
         owner = np.concatenate([owner, owner])
     return np.concatenate(centers), np.concatenate(owners), radius
 
 
 def squared_distance_to_triangles(points: NDArray, corners: NDArray) -> NDArray[np.float64]:
-    """Squared distance (N,) of each point (N, 3) to its own triangle (N, 3, 3); a triangle may be a segment or a point."""
+    """Squared distance (N,) of each point (N, 3) to its own triangle (N, 3, 3); a triangle may be a
+    segment or a point.
+    """
     a, b, c = corners.swapaxes(0, 1)
     ab, ac, ap = b - a, c - a, points - a
     normal = np.cross(ab, ac)
@@ -127,10 +169,13 @@ def squared_distance_to_triangles(points: NDArray, corners: NDArray) -> NDArray[
     flat = np.maximum(twice_area, 1e-300)
     w_b = np.einsum("nd,nd->n", np.cross(ap, ac), normal) / flat
     w_c = np.einsum("nd,nd->n", np.cross(ab, ap), normal) / flat
-    within = (w_b >= 0) & (w_c >= 0) & (w_b + w_c <= 1) & (twice_area > 0)  # the foot of the perpendicular lies in the triangle
+    # the foot of the perpendicular lies in the triangle
+    within = (w_b >= 0) & (w_c >= 0) & (w_b + w_c <= 1) & (twice_area > 0)
     to_plane = np.einsum("nd,nd->n", ap, normal) ** 2 / flat
-    to_edges = np.minimum(np.minimum(_squared_to_segment(points, a, b), _squared_to_segment(points, b, c)),
-                          _squared_to_segment(points, c, a))
+    to_edges = np.minimum(
+        np.minimum(_squared_to_segment(points, a, b), _squared_to_segment(points, b, c)),
+        _squared_to_segment(points, c, a),
+    )
     return np.where(within, to_plane, to_edges)
 
 

@@ -1,1 +1,3 @@
-"""Taichi kernels: plain functions, no state; a kernel writes only what its signature shows under `# out:`."""
+"""Taichi kernels: plain functions, no state; a kernel writes only what its signature shows under `#
+out:`.
+"""

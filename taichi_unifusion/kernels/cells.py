@@ -1,13 +1,26 @@
-"""Per-frame binning: points -> sums in the cells of the touched blocks -> samples for the regression (Sec. IV-B).
+"""Per-frame binning: points -> sums in the cells of the touched blocks -> samples for the
+regression (Sec. IV-B).
 
-Sums over points are kept as 64-bit fixed-point integers, so that they do not depend on the order in which threads add them;
-whoever reads the sums last leaves them zero.
+Sums over points are kept as 64-bit fixed-point integers, so that they do not depend on the order in
+which threads add them; whoever reads the sums last leaves them zero.
 """
 
 import taichi as ti
 
 from .voxels import (
-    BLOCK_CELLS, CELLS, INDEX_HALF, Floats1, Floats2, Ints1, Ints2, Masks2, Sums3, in_range, row3, touch, voxel_of,
+    BLOCK_CELLS,
+    CELLS,
+    INDEX_HALF,
+    Floats1,
+    Floats2,
+    Ints1,
+    Ints2,
+    Masks2,
+    Sums3,
+    in_range,
+    row3,
+    touch,
+    voxel_of,
 )
 
 FIXED = float(1 << 24)  # fixed-point one: steps of 6e-8, room for 5e11 in sums
@@ -35,22 +48,26 @@ def cell_center(cell: ti.i32):
 @ti.kernel
 def bin_points(
     # in:
-    points: Floats2,   # (N, 3) world [m]
-    values_0: Floats2, values_1: Floats2, values_2: Floats2, values_3: Floats2,  # (N, c_i); any where c_i is 0
+    points: Floats2,  # (N, 3) world [m]
+    values_0: Floats2,
+    values_1: Floats2,
+    values_2: Floats2,
+    values_3: Floats2,  # (N, c_i); any where c_i is 0
     channels: ti.template(),  # c_i of the four
     per_meter: ti.f32,
     chunk: ti.i32,
     with_positions: ti.template(),
     block: ti.template(),
     # out:
-    counts: Ints2,     # (B, 64) += points in the cell
-    sums: Sums3,       # (B, 64, sum of c_i [+ 3]) += values side by side, then position from the cell centre [voxels]
+    counts: Ints2,  # (B, 64) += points in the cell
+    sums: Sums3,  # (B, 64, sum of c_i [+ 3]) += values side by side, then position from the cell centre [voxels]
 ):
     for part in range((points.shape[0] + chunk - 1) // chunk):
         width = ti.static(sum(channels) + (3 if with_positions else 0))
         place = ti.Vector([INDEX_HALF * CELLS, 0, 0])  # of the cell in the lattice of all cells
         b, run = -1, 0
-        total = ti.Vector([0.0] * max(width, 1))  # in floats over a run: one thread adds it, always in the same order
+        # in floats over a run: one thread adds it, always in the same order
+        total = ti.Vector([0.0] * max(width, 1))
         for n in range(part * chunk, ti.min((part + 1) * chunk, points.shape[0])):
             x = row3(points, n) * (per_meter * CELLS)
             at = ti.floor(x, ti.i32)
@@ -74,8 +91,15 @@ def bin_points(
 
 
 @ti.func
-def add_run(width: ti.template(), b: ti.i32, place: ti.template(), run: ti.i32, total: ti.template(), counts: ti.template(),
-            sums: ti.template()):
+def add_run(
+    width: ti.template(),
+    b: ti.i32,
+    place: ti.template(),
+    run: ti.i32,
+    total: ti.template(),
+    counts: ti.template(),
+    sums: ti.template(),
+):
     """Add the sums over a run of points to their cell."""
     cell = ((place[0] & 3) * CELLS + (place[1] & 3)) * CELLS + (place[2] & 3)
     ti.atomic_add(counts[b, cell], run)
@@ -84,8 +108,12 @@ def add_run(width: ti.template(), b: ti.i32, place: ti.template(), run: ti.i32, 
 
 
 @ti.func
-def surfel(b: ti.i32, cell: ti.i32, keys: ti.template(), counts: ti.template(), sums: ti.template()):
-    """Mean point [voxels] and mean unit normal of the points in a cell; a zero normal where they cancel."""
+def surfel(
+    b: ti.i32, cell: ti.i32, keys: ti.template(), counts: ti.template(), sums: ti.template()
+):
+    """Mean point [voxels] and mean unit normal of the points in a cell; a zero normal where they
+    cancel.
+    """
     scale = 1.0 / (ti.cast(counts[b, cell], ti.f32) * FIXED)
     normal = ti.Vector([ti.cast(sums[b, cell, d], ti.f32) * scale for d in ti.static(range(3))])
     point = ti.Vector([ti.cast(sums[b, cell, 3 + d], ti.f32) * scale for d in ti.static(range(3))])
@@ -98,16 +126,18 @@ def surfel(b: ti.i32, cell: ti.i32, keys: ti.template(), counts: ti.template(), 
 def touch_surfel_samples(
     # in:
     blocks: ti.i32,
-    counts: Ints2,     # (B, 64)
-    sums: Sums3,       # (B, 64, 6) normals, positions
+    counts: Ints2,  # (B, 64)
+    sums: Sums3,  # (B, 64, 6) normals, positions
     offsets: Floats1,  # (S,) along the normal [voxels]
     frame: ti.i32,
     # out:
-    stamp: ti.template(), block: ti.template(),
+    stamp: ti.template(),
+    block: ti.template(),
     keys: Ints2,
     counters: Ints1,
 ):
-    for b, cell in ti.ndrange(blocks, BLOCK_CELLS):  # cells, not blocks: enough of them to share out evenly
+    # cells, not blocks: enough of them to share out evenly
+    for b, cell in ti.ndrange(blocks, BLOCK_CELLS):
         if counts[b, cell] > 0:
             point, normal = surfel(b, cell, keys, counts, sums)
             for s in range(offsets.shape[0]):
@@ -120,18 +150,19 @@ def touch_surfel_samples(
 def bin_surfel_samples(
     # in:
     blocks: ti.i32,
-    keys: Ints2,           # (B, 3)
-    offsets: Floats1,      # (S,) along the normal [voxels]
+    keys: Ints2,  # (B, 3)
+    offsets: Floats1,  # (S,) along the normal [voxels]
     with_normals: ti.template(),
     block: ti.template(),
     # in and out:
-    counts: Ints2,         # (B, 64) read, then 0
-    sums: Sums3,           # (B, 64, 6) normals, positions; read, then 0
+    counts: Ints2,  # (B, 64) read, then 0
+    sums: Sums3,  # (B, 64, 6) normals, positions; read, then 0
     # out:
     sample_counts: Ints2,  # (B, 64) += points behind the sample
-    sample_sums: Sums3,    # (B, 64, 1 [+ 3]) += their signed distance to the surfel's plane [voxels], and its normal
+    sample_sums: Sums3,  # (B, 64, 1 [+ 3]) += their signed distance to the surfel's plane [voxels], and its normal
 ):
-    for b, cell in ti.ndrange(blocks, BLOCK_CELLS):  # cells, not blocks: enough of them to share out evenly
+    # cells, not blocks: enough of them to share out evenly
+    for b, cell in ti.ndrange(blocks, BLOCK_CELLS):
         if counts[b, cell] > 0:
             point, normal = surfel(b, cell, keys, counts, sums)
             for s in range(offsets.shape[0]):
@@ -145,7 +176,10 @@ def bin_surfel_samples(
                     distance = normal.dot(cell_center(target) + ijk - point)
                     count = counts[b, cell]
                     ti.atomic_add(sample_counts[at, target], count)
-                    ti.atomic_add(sample_sums[at, target, 0], ti.cast(ti.round(distance * FIXED), ti.i64) * count)
+                    ti.atomic_add(
+                        sample_sums[at, target, 0],
+                        ti.cast(ti.round(distance * FIXED), ti.i64) * count,
+                    )
                     if ti.static(with_normals):
                         for d in ti.static(range(3)):
                             along = ti.cast(ti.round(normal[d] * FIXED), ti.i64)
@@ -159,13 +193,13 @@ def bin_surfel_samples(
 def mark_cells(
     # in:
     blocks: ti.i32,
-    counts: Ints2,    # (B, 64)
+    counts: Ints2,  # (B, 64)
     minimum: ti.i32,
     # out:
-    masks: Masks2,    # (B, 2) bit 31-k of word j: cell 32 j + k holds a point
+    masks: Masks2,  # (B, 2) bit 31-k of word j: cell 32 j + k holds a point
     support: Masks2,  # (B, 2) the same, for at least `minimum` points, or half a sparse block's mean; 0 sets all
-    totals: Ints1,    # (B,) points
-    cells: Ints1,     # (B,) cells that hold points
+    totals: Ints1,  # (B,) points
+    cells: Ints1,  # (B,) cells that hold points
 ):
     for b in range(blocks):
         total, occupied = 0, 0
@@ -193,14 +227,14 @@ def mark_cells(
 def compact_cells(
     # in:
     blocks: ti.i32,
-    starts: Ints1,     # (B,) first row of each block
-    masks: Masks2,     # (B, 2) cells that hold points
+    starts: Ints1,  # (B,) first row of each block
+    masks: Masks2,  # (B, 2) cells that hold points
     channels: ti.template(),
     # in and out:
-    counts: Ints2,     # (B, 64) read, then 0
-    sums: Sums3,       # (B, 64, c) read, then 0
+    counts: Ints2,  # (B, 64) read, then 0
+    sums: Sums3,  # (B, 64, c) read, then 0
     # out:
-    cells: Floats2,    # (M, 1 + c) for every cell with points, in order: square root of its count, mean values times that
+    cells: Floats2,  # (M, 1 + c) for every cell with points, in order: square root of its count, mean values times that
 ):
     for b in range(blocks):
         row = starts[b]

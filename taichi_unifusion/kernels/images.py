@@ -1,6 +1,7 @@
 """Preprocessing on the image grid, and rigid motion.
 
-Every input is real somewhere: readings are tested by their bits, because the compiler may assume that there is no NaN.
+Every input is real somewhere: readings are tested by their bits, because the compiler may assume
+that there is no NaN.
 """
 
 import taichi as ti
@@ -14,23 +15,25 @@ PIXEL_CHUNK = 64  # pixels that one thread compacts
 @ti.kernel
 def clip_depth(
     # in:
-    depth: Floats2,    # (H, W) [m], anything
-    depth_min: ti.f32, depth_max: ti.f32,
+    depth: Floats2,  # (H, W) [m], anything
+    depth_min: ti.f32,
+    depth_max: ti.f32,
     # out:
     clipped: Floats2,  # (H, W) [m], 0 where there is no reading in range
 ):
     low, high = ti.bit_cast(depth_min, ti.i32), ti.bit_cast(depth_max, ti.i32)
     for v, u in depth:
-        bits = ti.bit_cast(depth[v, u], ti.i32)  # ordered as positive floats are; NaN and inf lie above, negatives below
+        # ordered as positive floats are; NaN and inf lie above, negatives below
+        bits = ti.bit_cast(depth[v, u], ti.i32)
         clipped[v, u] = depth[v, u] if bits >= low and bits <= high else 0.0
 
 
 @ti.kernel
 def drop_flying_pixels(
     # in:
-    depth: Floats2,    # (H, W) [m], 0: none
-    jump: ti.f32,      # pixels whose depths differ by less than this share belong together
-    support: ti.i32,   # of its 8 neighbours, so many must belong together with a pixel
+    depth: Floats2,  # (H, W) [m], 0: none
+    jump: ti.f32,  # pixels whose depths differ by less than this share belong together
+    support: ti.i32,  # of its 8 neighbours, so many must belong together with a pixel
     # out:
     inverse: Floats2,  # (H, W) [1/m], 0 where there is no reading or a pixel hangs between surfaces
 ):
@@ -46,15 +49,24 @@ def drop_flying_pixels(
 
 
 @ti.func
-def inverse_depth_slope(inverse: ti.template(), v: ti.i32, u: ti.i32, radius: ti.template(), jump: ti.f32):
-    """Least-squares slopes of 1/z by u and v over a window, from pairs of pixels opposite to (v, u) that belong with it.
+def inverse_depth_slope(
+    inverse: ti.template(), v: ti.i32, u: ti.i32, radius: ti.template(), jump: ti.f32
+):
+    """Least-squares slopes of 1/z by u and v over a window, from pairs of pixels opposite to (v, u)
+    that belong with it.
 
-    A plane has an inverse depth that is linear in the image. Also returns the smaller sum of squares of the two fits.
+    A plane has an inverse depth that is linear in the image. Also returns the smaller sum of
+    squares of the two fits.
     """
     q = inverse[v, u]
     near = jump * q
     along_u, along_v, square_u, square_v = 0.0, 0.0, 0.0, 0.0
-    if v >= radius and u >= radius and v < inverse.shape[0] - radius and u < inverse.shape[1] - radius:
+    if (
+        v >= radius
+        and u >= radius
+        and v < inverse.shape[0] - radius
+        and u < inverse.shape[1] - radius
+    ):
         for i in range(-radius, radius + 1):
             for k in ti.static(range(1, radius + 1)):
                 right, left = inverse[v + i, u + k], inverse[v + i, u - k]
@@ -65,19 +77,26 @@ def inverse_depth_slope(inverse: ti.template(), v: ti.i32, u: ti.i32, radius: ti
                 square_u += ti.select(with_u, 2.0 * k * k, 0.0)
                 along_v += ti.select(with_v, k * (below - above), 0.0)
                 square_v += ti.select(with_v, 2.0 * k * k, 0.0)
-    return along_u / ti.max(square_u, 1.0), along_v / ti.max(square_v, 1.0), ti.min(square_u, square_v)
+    return (
+        along_u / ti.max(square_u, 1.0),
+        along_v / ti.max(square_v, 1.0),
+        ti.min(square_u, square_v),
+    )
 
 
 @ti.kernel
 def estimate_normals(
     # in:
-    inverse: Floats2,   # (H, W) 1/z [1/m], 0: none
-    fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32,
+    inverse: Floats2,  # (H, W) 1/z [1/m], 0: none
+    fx: ti.f32,
+    fy: ti.f32,
+    cx: ti.f32,
+    cy: ti.f32,
     radius: ti.template(),  # of the window [pixels]
     jump: ti.f32,
     cos_max_angle: ti.f32,  # between the normal and the ray back to the camera
     # out:
-    normals: Floats3,   # (H, W, 3) unit, towards the camera; z component 0 where there is none
+    normals: Floats3,  # (H, W, 3) unit, towards the camera; z component 0 where there is none
 ):
     height, width = inverse.shape[0], inverse.shape[1]
     for v2, u2 in ti.ndrange((height + 1) // 2, (width + 1) // 2):
@@ -93,8 +112,17 @@ def estimate_normals(
                         of = q
                     if found >= 2 * radius * radius:
                         ray = ti.Vector([(u - cx) / fx, (v - cy) / fy, 1.0])
-                        m = ti.Vector([slope_u * fx, slope_v * fy, q - slope_u * (u - cx) - slope_v * (v - cy)]) / q
-                        if 1.0 >= cos_max_angle * m.norm() * ray.norm():  # m . ray = 1
+                        m = (
+                            ti.Vector(
+                                [
+                                    slope_u * fx,
+                                    slope_v * fy,
+                                    q - slope_u * (u - cx) - slope_v * (v - cy),
+                                ]
+                            )
+                            / q
+                        )
+                        if cos_max_angle * m.norm() * ray.norm() <= 1.0:  # m . ray = 1
                             n = -m.normalized()
                 for d in ti.static(range(3)):
                     normals[v, u, d] = n[d]
@@ -105,7 +133,7 @@ def count_points(
     # in:
     normals: Floats3,  # (H, W, 3)
     # out:
-    counts: Ints1,     # (H W / PIXEL_CHUNK,) pixels with a normal
+    counts: Ints1,  # (H W / PIXEL_CHUNK,) pixels with a normal
 ):
     width, size = normals.shape[1], normals.shape[0] * normals.shape[1]
     for chunk in range(counts.shape[0]):
@@ -118,13 +146,17 @@ def count_points(
 @ti.kernel
 def unproject(
     # in:
-    depth: Floats2, normals: Floats3,
-    fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32,
-    starts: Ints1,        # (H W / PIXEL_CHUNK,) first point of each chunk
+    depth: Floats2,
+    normals: Floats3,
+    fx: ti.f32,
+    fy: ti.f32,
+    cx: ti.f32,
+    cy: ti.f32,
+    starts: Ints1,  # (H W / PIXEL_CHUNK,) first point of each chunk
     # out:
-    points: Floats2,      # (N, 3) camera [m]
+    points: Floats2,  # (N, 3) camera [m]
     point_normals: Floats2,  # (N, 3)
-    pixels: Ints2,        # (N, 2) row and column
+    pixels: Ints2,  # (N, 2) row and column
 ):
     width, size = depth.shape[1], depth.shape[0] * depth.shape[1]
     for chunk in range(starts.shape[0]):
@@ -143,8 +175,8 @@ def unproject(
 @ti.kernel
 def sample_color(
     # in:
-    pixels: Ints2,   # (N or more, 2)
-    color: Bytes3,   # (H, W, 3)
+    pixels: Ints2,  # (N or more, 2)
+    color: Bytes3,  # (H, W, 3)
     # out:
     values: Floats2,  # (N, 3) in [0, 1]
 ):
@@ -156,8 +188,8 @@ def sample_color(
 @ti.kernel
 def sample_image(
     # in:
-    pixels: Ints2,    # (N or more, 2)
-    image: Floats3,   # (H, W, c)
+    pixels: Ints2,  # (N or more, 2)
+    image: Floats3,  # (H, W, c)
     # out:
     values: Floats2,  # (N, c)
 ):
@@ -172,7 +204,7 @@ def transform(
     points: Floats2,  # (N, 3) in a
     matrix: Floats2,  # (3, 4) T_b_a without its last row
     # out:
-    moved: Floats2,   # (N, 3) in b
+    moved: Floats2,  # (N, 3) in b
 ):
     R = ti.Matrix([[matrix[i, j] for j in range(3)] for i in range(3)])
     t = ti.Vector([matrix[i, 3] for i in range(3)])

@@ -1,4 +1,5 @@
-"""Features of a map when they are asked for: texts times rows, the regression of each voxel, its value at points (Sec. IV-D).
+"""Features of a map when they are asked for: texts times rows, the regression of each voxel, its
+value at points (Sec. IV-D).
 
 See `latent.py` for what a voxel keeps.
 """
@@ -9,17 +10,19 @@ from .latent import Bytes1, Rows2
 from .query import nearest_voxel
 from .voxels import INDEX_HALF, Floats1, Floats2, Floats3, all_within, row3, voxel_of
 
-DIRECTIONS = 4   # texts that are worked on at once
+DIRECTIONS = 4  # texts that are worked on at once
 
 
 @ti.kernel
 def project_rows(
     # in:
     voxels: ti.i32,
-    means: Rows2, slopes: Rows2, scales: Floats2,  # (S, c), (S, q c), (S, q)
+    means: Rows2,
+    slopes: Rows2,
+    scales: Floats2,  # (S, c), (S, q c), (S, q)
     directions: Floats2,  # (T, c), T a multiple of DIRECTIONS
     # out:
-    products: Floats3,    # (S, 1 + q, T)
+    products: Floats3,  # (S, 1 + q, T)
 ):
     for s in range(voxels):
         channels = means.shape[1]
@@ -45,7 +48,9 @@ def project_rows(
 def take_channels(
     # in:
     voxels: ti.i32,
-    means: Rows2, slopes: Rows2, scales: Floats2,  # (S, c), (S, q c), (S, q)
+    means: Rows2,
+    slopes: Rows2,
+    scales: Floats2,  # (S, c), (S, q c), (S, q)
     first: ti.i32,
     # out:
     products: Floats3,  # (S, 1 + q, T) channels first .. first + T, as far as there are so many
@@ -54,14 +59,16 @@ def take_channels(
         for t in range(ti.min(products.shape[2], means.shape[1] - first)):
             products[s, 0, t] = ti.cast(means[s, first + t], ti.f32)
             for a in range(scales.shape[1]):
-                products[s, 1 + a, t] = ti.cast(slopes[s, a * means.shape[1] + first + t], ti.f32) * scales[s, a]
+                products[s, 1 + a, t] = (
+                    ti.cast(slopes[s, a * means.shape[1] + first + t], ti.f32) * scales[s, a]
+                )
 
 
 @ti.kernel
 def mean_lengths(
     # in:
     voxels: ti.i32,
-    means: Rows2,      # (S, c)
+    means: Rows2,  # (S, c)
     # out:
     lengths: Floats1,  # (S,) |E[y]|
 ):
@@ -78,9 +85,9 @@ def solve_rows(
     # in:
     rank: ti.template(),
     voxels: ti.i32,
-    moments: Floats3,   # (S, q + q (q + 1) / 2, 1)
-    weights: Floats1,   # (S,)
-    noise: ti.f32,      # d of Eq. 6 for one feature pixel
+    moments: Floats3,  # (S, q + q (q + 1) / 2, 1)
+    weights: Floats1,  # (S,)
+    noise: ti.f32,  # d of Eq. 6 for one feature pixel
     # in and out:
     products: Floats3,  # (S, 1 + q, T) products of mean and slopes -> the constant and the coefficients of f_posi
 ):
@@ -118,7 +125,9 @@ def solve_rows(
 
 @ti.func
 def table_features(t: ti.template(), rank: ti.template(), table: ti.template(), nodes: ti.i32):
-    """Position features at t by trilinear interpolation in a table of nodes^3 rows that spans [-0.5, 0.5]^3."""
+    """Position features at t by trilinear interpolation in a table of nodes^3 rows that spans
+    [-0.5, 0.5]^3.
+    """
     x = (t + 0.5) * (nodes - 1)
     corner = ti.math.clamp(ti.floor(x, ti.i32), 0, nodes - 2)
     r = x - corner
@@ -139,22 +148,23 @@ def table_features(t: ti.template(), rank: ti.template(), table: ti.template(), 
 def query_products(
     # in:
     rank: ti.template(),
-    points: Floats2,     # (N, 3) world [m]
+    points: Floats2,  # (N, 3) world [m]
     per_meter: ti.f32,
     slot: ti.template(),
-    products: Floats3,   # (S, 1 + q, T) constants and coefficients, T a multiple of DIRECTIONS
-    table: Floats2,      # (nodes^3, q)
+    products: Floats3,  # (S, 1 + q, T) constants and coefficients, T a multiple of DIRECTIONS
+    table: Floats2,  # (nodes^3, q)
     nodes: ti.i32,
-    reach: ti.i32,       # points that no voxel covers take the value of the nearest one within so many voxels
+    reach: ti.i32,  # points that no voxel covers take the value of the nearest one within so many voxels
     # out:
-    values: Floats2,     # (N, T)
-    valid: Bytes1,       # (N,) = 1 where a voxel covers the point
+    values: Floats2,  # (N, T)
+    valid: Bytes1,  # (N,) = 1 where a voxel covers the point
 ):
     for n in range(points.shape[0]):
         x = row3(points, n) * per_meter
         weight, covered, found = 0.0, 0, 0
         slots = ti.Vector([0] * 9)
-        shares = ti.Vector([0.0] * (9 * (1 + rank)))  # of each voxel's constant and coefficients in the value
+        # of each voxel's constant and coefficients in the value
+        shares = ti.Vector([0.0] * (9 * (1 + rank)))
         if all_within(x, INDEX_HALF - 1.0):
             corner = voxel_of(x - 0.5)
             for o in range(9):
@@ -169,7 +179,8 @@ def query_products(
                     tent = 1.0
                     for d in ti.static(range(3)):
                         tent *= ti.max(1.0 - 2.0 * ti.abs(at[d]), 0.0)
-                    tent = ti.max(tent, 1e-6)  # on the border of the only voxel there is, its value still counts
+                    # on the border of the only voxel there is, its value still counts
+                    tent = ti.max(tent, 1e-6)
                     f = table_features(at, rank, table, nodes)
                     shares[found * (1 + rank)] = tent
                     for a in ti.static(range(rank)):
@@ -184,6 +195,9 @@ def query_products(
             for i in range(found):
                 for a in range(1 + rank):
                     for t in ti.static(range(DIRECTIONS)):
-                        sums[t] += shares[i * (1 + rank) + a] * products[slots[i], a, part * DIRECTIONS + t]
+                        sums[t] += (
+                            shares[i * (1 + rank) + a]
+                            * products[slots[i], a, part * DIRECTIONS + t]
+                        )
             for t in ti.static(range(DIRECTIONS)):
                 values[n, part * DIRECTIONS + t] = sums[t] / ti.max(weight, 1e-12)

@@ -1,4 +1,6 @@
-"""Marching cubes on sparse cubes of samples, with vertices shared across cube borders (Lorensen and Cline)."""
+"""Marching cubes on sparse cubes of samples, with vertices shared across cube borders (Lorensen and
+Cline).
+"""
 
 import taichi as ti
 
@@ -10,7 +12,9 @@ Cases2 = ti.types.ndarray(dtype=ti.u8, ndim=2)
 
 @ti.func
 def sample_at(q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.template()):
-    """Cube and sample number of lattice sample ijk of cube q, which may lie in a cube above; cube -1 where there is none."""
+    """Cube and sample number of lattice sample ijk of cube q, which may lie in a cube above; cube
+    -1 where there is none.
+    """
     over = ti.cast(ijk >= resolution, ti.i32)
     cube = upper[q, over[0] * 4 + over[1] * 2 + over[2]]
     at = ijk - over * resolution
@@ -18,8 +22,12 @@ def sample_at(q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.templ
 
 
 @ti.func
-def cell_case(q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.template(), sdf: ti.template()) -> ti.i32:
-    """Bit o set where corner o (x slowest) lies behind the surface; 0, no surface, where a corner is unknown."""
+def cell_case(
+    q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.template(), sdf: ti.template()
+) -> ti.i32:
+    """Bit o set where corner o (x slowest) lies behind the surface; 0, no surface, where a corner
+    is unknown.
+    """
     case, known = 0, True
     for o in range(8):
         cube, s = sample_at(q, ijk + ti.Vector([o // 4, o // 2 % 2, o % 2]), resolution, upper)
@@ -34,7 +42,9 @@ def cell_case(q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.templ
 
 
 @ti.func
-def is_supported(support: ti.template(), q: ti.i32, ijk: ti.template(), resolution: ti.i32) -> ti.i32:
+def is_supported(
+    support: ti.template(), q: ti.i32, ijk: ti.template(), resolution: ti.i32
+) -> ti.i32:
     """Whether the support cell that contains the middle of a mesh cell is set."""
     cell = (2 * ijk + 1) * CELLS // (2 * resolution)
     bit = (cell[0] * CELLS + cell[1]) * CELLS + cell[2]
@@ -45,21 +55,23 @@ def is_supported(support: ti.template(), q: ti.i32, ijk: ti.template(), resoluti
 def classify_cells(
     # in:
     resolution: ti.i32,
-    upper: Ints2,          # (Q, 8) cube at step (o / 4, o / 2 % 2, o % 2), or -1
-    support: Masks2,       # (Q, 2)
-    sdf: Floats2,          # (Q, R^3)
+    upper: Ints2,  # (Q, 8) cube at step (o / 4, o / 2 % 2, o % 2), or -1
+    support: Masks2,  # (Q, 2)
+    sdf: Floats2,  # (Q, R^3)
     triangle_counts: Ints1,  # (256,)
-    corner_edges: Ints2,   # (12, 4) lower corner (3) and axis of each cell edge
-    edge_flags: Ints1,     # (256,) bit e: the case has a vertex on edge e
+    corner_edges: Ints2,  # (12, 4) lower corner (3) and axis of each cell edge
+    edge_flags: Ints1,  # (256,) bit e: the case has a vertex on edge e
     # out:
-    cases: Cases2,         # (Q, R^3) case of each cell, 0 where empty or unsupported
-    edges: Ints2,         # (Q, R^3) bit d: a vertex lies on the edge from the sample along axis d
-    triangles: Ints1,      # (Q,) triangles
+    cases: Cases2,  # (Q, R^3) case of each cell, 0 where empty or unsupported
+    edges: Ints2,  # (Q, R^3) bit d: a vertex lies on the edge from the sample along axis d
+    triangles: Ints1,  # (Q,) triangles
 ):
     for q in range(sdf.shape[0]):
         total = 0
         for c in range(sdf.shape[1]):
-            ijk = ti.Vector([c // (resolution * resolution), c // resolution % resolution, c % resolution])
+            ijk = ti.Vector(
+                [c // (resolution * resolution), c // resolution % resolution, c % resolution]
+            )
             case = 0
             if is_supported(support, q, ijk, resolution) == 1:
                 case = cell_case(q, ijk, resolution, upper, sdf)
@@ -76,7 +88,7 @@ def classify_cells(
 @ti.kernel
 def count_vertices(
     # in:
-    edges: Ints2,    # (Q, R^3)
+    edges: Ints2,  # (Q, R^3)
     # out:
     vertices: Ints1,  # (Q,)
 ):
@@ -92,27 +104,31 @@ def count_vertices(
 def place_vertices(
     # in:
     resolution: ti.i32,
-    keys: Ints2,       # (Q, 3) lattice corners, in voxels; a cube spans [key - 1/2, key + 1/2)
+    keys: Ints2,  # (Q, 3) lattice corners, in voxels; a cube spans [key - 1/2, key + 1/2)
     upper: Ints2,
     sdf: Floats2,
     edges: Ints2,
-    starts: Ints1,     # (Q,) first vertex of each cube
+    starts: Ints1,  # (Q,) first vertex of each cube
     voxel_size: ti.f32,
     # out:
-    first: Ints2,       # (Q, R^3) first vertex on the edges of a sample
+    first: Ints2,  # (Q, R^3) first vertex on the edges of a sample
     vertices: Floats2,  # (V, 3) world [m]
 ):
     for q in range(sdf.shape[0]):
         v = starts[q]
         for s in range(sdf.shape[1]):
             first[q, s] = v
-            ijk = ti.Vector([s // (resolution * resolution), s // resolution % resolution, s % resolution])
+            ijk = ti.Vector(
+                [s // (resolution * resolution), s // resolution % resolution, s % resolution]
+            )
             for d in range(3):
                 if edges[q, s] >> d & 1:
                     along = ti.Vector([d == 0, d == 1, d == 2])
                     cube, other = sample_at(q, ijk + ti.cast(along, ti.i32), resolution, upper)
                     a, b = sdf[q, s], sdf[cube, other]
-                    x = (ti.cast(ijk, ti.f32) + ti.cast(along, ti.f32) * (a / (a - b))) / resolution - 0.5
+                    x = (
+                        ti.cast(ijk, ti.f32) + ti.cast(along, ti.f32) * (a / (a - b))
+                    ) / resolution - 0.5
                     for k in ti.static(range(3)):
                         vertices[v, k] = (keys[q, k] + x[k]) * voxel_size
                     v += 1
@@ -126,18 +142,20 @@ def emit_triangles(
     cases: Cases2,
     edges: Ints2,
     first: Ints2,
-    starts: Ints1,           # (Q,) first triangle of each cube
+    starts: Ints1,  # (Q,) first triangle of each cube
     triangle_counts: Ints1,  # (256,)
-    triangle_edges: Ints2,   # (256, 15) cell edges, three a triangle
-    corner_edges: Ints2,     # (12, 4)
+    triangle_edges: Ints2,  # (256, 15) cell edges, three a triangle
+    corner_edges: Ints2,  # (12, 4)
     # out:
-    faces: Ints2,             # (F, 3)
+    faces: Ints2,  # (F, 3)
 ):
     for q in range(cases.shape[0]):
         f = starts[q]
         for c in range(cases.shape[1]):
             case = ti.cast(cases[q, c], ti.i32)
-            ijk = ti.Vector([c // (resolution * resolution), c // resolution % resolution, c % resolution])
+            ijk = ti.Vector(
+                [c // (resolution * resolution), c // resolution % resolution, c % resolution]
+            )
             for t in range(triangle_counts[case]):
                 for k in range(3):
                     e = triangle_edges[case, 3 * t + k]
@@ -153,13 +171,17 @@ def emit_triangles(
 def sum_normals(
     # in:
     vertices: Floats2,  # (V, 3)
-    faces: Ints2,        # (F, 3)
-    per_area: ti.f32,   # scale of the cross products, so that sums fit the integers
+    faces: Ints2,  # (F, 3)
+    per_area: ti.f32,  # scale of the cross products, so that sums fit the integers
     # out:
-    normals: Ints2,      # (V, 3) += area-weighted face normals, fixed point: the same in any order
+    normals: Ints2,  # (V, 3) += area-weighted face normals, fixed point: the same in any order
 ):
     for f in range(faces.shape[0]):
-        a, b, c = row3(vertices, faces[f, 0]), row3(vertices, faces[f, 1]), row3(vertices, faces[f, 2])
+        a, b, c = (
+            row3(vertices, faces[f, 0]),
+            row3(vertices, faces[f, 1]),
+            row3(vertices, faces[f, 2]),
+        )
         n = (b - a).cross(c - a) * per_area
         for k in ti.static(range(3)):
             for d in ti.static(range(3)):
@@ -169,13 +191,14 @@ def sum_normals(
 @ti.kernel
 def join_parts(
     # in:
-    faces: Ints2,    # (F, 3)
+    faces: Ints2,  # (F, 3)
     # in and out:
-    part: Ints1,     # (V,) a vertex of the same connected part, in the end the first of them all
+    part: Ints1,  # (V,) a vertex of the same connected part, in the end the first of them all
     # out:
     changed: Ints1,  # [0] = 1 unless this was the last round
 ):
-    for f in range(faces.shape[0]):  # the faces' corners take over the lowest number among them, also at their roots
+    # the faces' corners take over the lowest number among them, also at their roots
+    for f in range(faces.shape[0]):
         a, b, c = part[faces[f, 0]], part[faces[f, 1]], part[faces[f, 2]]
         lowest = ti.min(a, b, c)
         if a != lowest or b != lowest or c != lowest:

@@ -1,18 +1,38 @@
-"""Decoding: f_dec(x, F) = f_posi(t) F at points and on the grid for marching cubes (Eq. 7, Sec. IV-B)."""
+"""Decoding: f_dec(x, F) = f_posi(t) F at points and on the grid for marching cubes (Eq. 7, Sec.
+IV-B).
+"""
 
 import taichi as ti
 
 from .cells import cell_index
 from .encoding import position_features
-from .voxels import BLOCK_CELLS, CELLS, INDEX_HALF, Floats2, Floats3, Ints2, Masks2, all_within, row3, voxel_of
+from .voxels import (
+    BLOCK_CELLS,
+    CELLS,
+    INDEX_HALF,
+    Floats2,
+    Floats3,
+    Ints2,
+    Masks2,
+    all_within,
+    row3,
+    voxel_of,
+)
 
 UNKNOWN = 1e9  # signed distance where no voxel reaches
 
 
 @ti.func
 def decode(
-    rank: ti.template(), channels: ti.template(), centered: ti.template(), s: ti.i32, t: ti.template(),
-    latents: ti.template(), anchors: ti.template(), projection: ti.template(), scale: ti.f32,
+    rank: ti.template(),
+    channels: ti.template(),
+    centered: ti.template(),
+    s: ti.i32,
+    t: ti.template(),
+    latents: ti.template(),
+    anchors: ti.template(),
+    projection: ti.template(),
+    scale: ti.f32,
 ):
     """f_dec(t, F) of the voxel in slot s, plus its prior mean (Eq. 7)."""
     f = position_features(t, rank, anchors, projection, scale)
@@ -27,7 +47,9 @@ def decode(
 
 @ti.func
 def nearest_voxel(x: ti.template(), reach: ti.i32, slot: ti.template()):
-    """Slot of the voxel whose centre is nearest to x within `reach` voxels along each axis, or -1, and its index."""
+    """Slot of the voxel whose centre is nearest to x within `reach` voxels along each axis, or -1,
+    and its index.
+    """
     home = voxel_of(x)
     found, at, nearest = -1, home, 1e9
     for o in range((2 * reach + 1) ** 3):
@@ -44,16 +66,20 @@ def nearest_voxel(x: ti.template(), reach: ti.i32, slot: ti.template()):
 @ti.kernel
 def query_points(
     # in:
-    rank: ti.template(), channels: ti.template(), centered: ti.template(),
-    blend: ti.template(),   # all doubled voxels that contain the point, with tent weights; else its own voxel only
-    points: Floats2,        # (N, 3) world [m]
+    rank: ti.template(),
+    channels: ti.template(),
+    centered: ti.template(),
+    blend: ti.template(),  # all doubled voxels that contain the point, with tent weights; else its own voxel only
+    points: Floats2,  # (N, 3) world [m]
     per_meter: ti.f32,
     slot: ti.template(),
-    latents: Floats3,       # (S, l [+ 1], c)
-    anchors: Floats2, projection: Floats2, scale: ti.f32,
-    reach: ti.i32,          # points that no voxel covers take the value of the nearest one within so many voxels
+    latents: Floats3,  # (S, l [+ 1], c)
+    anchors: Floats2,
+    projection: Floats2,
+    scale: ti.f32,
+    reach: ti.i32,  # points that no voxel covers take the value of the nearest one within so many voxels
     # out:
-    values: Floats2,        # (N, c) 0 where there is none
+    values: Floats2,  # (N, c) 0 where there is none
     valid: ti.types.ndarray(dtype=ti.u8, ndim=1),  # (N,) = 1 where a voxel covers the point
 ):
     for n in range(points.shape[0]):
@@ -76,8 +102,11 @@ def query_points(
                     if ti.static(blend):
                         for d in ti.static(range(3)):
                             tent *= ti.max(1.0 - 2.0 * ti.abs(t[d]), 0.0)
-                        tent = ti.max(tent, 1e-6)  # on the border of the only voxel there is, its value still counts
-                    total += tent * decode(rank, channels, centered, s, t, latents, anchors, projection, scale)
+                        # on the border of the only voxel there is, its value still counts
+                        tent = ti.max(tent, 1e-6)
+                    total += tent * decode(
+                        rank, channels, centered, s, t, latents, anchors, projection, scale
+                    )
                     weight += tent
                     covered += ti.cast(o < covering, ti.i32)
         valid[n] = ti.cast(covered > 0, ti.u8)
@@ -95,19 +124,22 @@ def corner_slot(keys: ti.template(), q: ti.i32, o: ti.i32, slot: ti.template()) 
 @ti.kernel
 def corner_support(
     # in:
-    keys: Ints2,           # (Q, 3) lattice corners; the cube of corner q spans the centres of its eight voxels
+    keys: Ints2,  # (Q, 3) lattice corners; the cube of corner q spans the centres of its eight voxels
     slot: ti.template(),
-    map_masks: Masks2,     # (S, 2) support of each voxel's cells
-    closing: ti.i32,       # a cell with at least so many of its 26 neighbours supported is taken in: pinholes close, rims stay
+    map_masks: Masks2,  # (S, 2) support of each voxel's cells
+    # a cell with at least so many of its 26 neighbours supported is taken in: pinholes close, rims
+    # stay
+    closing: ti.i32,
     # out:
-    support: Masks2,       # (Q, 2) supported cells of the cube, as `mark_cells` numbers them
+    support: Masks2,  # (Q, 2) supported cells of the cube, as `mark_cells` numbers them
 ):
     for q in range(keys.shape[0]):
         around = ti.Vector([0] * BLOCK_CELLS)
         for o in range(8):
             s = corner_slot(keys, q, o, slot)
             if s >= 0:
-                # A voxel's cells 0..3 along an axis are cells -2..1 (upper voxel: 2..5) of the cube that starts at its centre.
+                # A voxel's cells 0..3 along an axis are cells -2..1 (upper voxel: 2..5) of the cube
+                # that starts at its centre.
                 base = ti.Vector([o // 4, o // 2 % 2, o % 2]) * CELLS - CELLS // 2
                 for half in range(2):
                     mask = map_masks[s, half]
@@ -132,13 +164,13 @@ def corner_support(
 def sdf_grid(
     # in:
     rank: ti.template(),
-    keys: Ints2,          # (Q, 3) lattice corners
+    keys: Ints2,  # (Q, 3) lattice corners
     slot: ti.template(),
-    latents: Floats3,     # (S, l, 1)
-    basis: Floats2,       # (R^3, 8 l) tent weight times f_posi of each voxel, at the R^3 samples of a cube
-    tents: Floats2,       # (R^3, 8)
+    latents: Floats3,  # (S, l, 1)
+    basis: Floats2,  # (R^3, 8 l) tent weight times f_posi of each voxel, at the R^3 samples of a cube
+    tents: Floats2,  # (R^3, 8)
     # out:
-    sdf: Floats2,         # (Q, R^3) signed distance [voxels], UNKNOWN where no voxel reaches
+    sdf: Floats2,  # (Q, R^3) signed distance [voxels], UNKNOWN where no voxel reaches
 ):
     for q in range(keys.shape[0]):
         F = ti.Vector([0.0] * (8 * rank))

@@ -1,8 +1,10 @@
-"""Colored ICP on image pyramids: surfel images, and the 6x6 normal equations of one Gauss-Newton step (Sec. V-A.1).
+"""Colored ICP on image pyramids: surfel images, and the 6x6 normal equations of one Gauss-Newton
+step (Sec. V-A.1).
 
-A *surfel image* holds in every pixel what registration asks of it, side by side in memory: depth, normal, intensity and its
-slopes. Association is projective: a source pixel's point, moved into the target camera, meets the pixel that it falls in. Every
-block of source rows keeps sums of its own, so that the result does not depend on the order in which threads run.
+A *surfel image* holds in every pixel what registration asks of it, side by side in memory: depth,
+normal, intensity and its slopes. Association is projective: a source pixel's point, moved into the
+target camera, meets the pixel that it falls in. Every block of source rows keeps sums of its own,
+so that the result does not depend on the order in which threads run.
 """
 
 import taichi as ti
@@ -10,32 +12,36 @@ import taichi as ti
 from .images import Bytes3
 from .voxels import Floats1, Floats2, Floats3
 
-DEPTH, NORMAL, INTENSITY, SLOPE_U, SLOPE_V, CHANNELS = 0, 1, 4, 5, 6, 8  # of a surfel image; 8 numbers fill half a cache line
+# of a surfel image; 8 numbers fill half a cache line
+DEPTH, NORMAL, INTENSITY, SLOPE_U, SLOPE_V, CHANNELS = 0, 1, 4, 5, 6, 8
 BLOCK_ROWS = 4  # used source rows that one thread sums
-CHUNK = 512     # iterations that a CPU thread takes at a time
+CHUNK = 512  # iterations that a CPU thread takes at a time
 
 # Columns of the sums: the upper triangle of H row by row, b, then these.
 H_SIZE, B_SIZE = 21, 6
-SOURCE = H_SIZE + B_SIZE    # source surfels
-IN_VIEW = SOURCE + 1        # of them, those that meet a target surfel
-INLIERS = SOURCE + 2        # of them, those near its plane with a like normal
-SQUARED_DISTANCE = SOURCE + 3    # of the inliers [m^2]
-COLORED = SOURCE + 4        # inliers whose intensity counts
-PHOTOMETRIC_SCALE = SOURCE + 5   # their weighted squared residuals
+SOURCE = H_SIZE + B_SIZE  # source surfels
+IN_VIEW = SOURCE + 1  # of them, those that meet a target surfel
+INLIERS = SOURCE + 2  # of them, those near its plane with a like normal
+SQUARED_DISTANCE = SOURCE + 3  # of the inliers [m^2]
+COLORED = SOURCE + 4  # inliers whose intensity counts
+PHOTOMETRIC_SCALE = SOURCE + 5  # their weighted squared residuals
 SUMS = SOURCE + 6
 FREEDOM = 5.0  # of the t distribution of intensity residuals (Kerl et al. 2013)
-LEAST_SLOPE = 0.012  # [1/px] of intensity: what is flatter is mostly noise, which would pass for texture on a blank wall
-NEAR = 0.05    # [m] what lies nearer to the target camera is not projected
+# [1/px] of intensity: what is flatter is mostly noise, which would pass for texture on a blank wall
+LEAST_SLOPE = 0.012
+NEAR = 0.05  # [m] what lies nearer to the target camera is not projected
 
 
 @ti.kernel
 def average_inverse_depth(
     # in:
-    inverse: Floats2,   # (H, W) [1/m], 0: none
+    inverse: Floats2,  # (H, W) [1/m], 0: none
     factor: ti.i32,
-    jump: ti.f32,       # readings that differ by less than this share lie on one surface
+    jump: ti.f32,  # readings that differ by less than this share lie on one surface
     # out:
-    averaged: Floats2,  # (H / factor, W / factor) mean over the nearest surface of a block, 0 where it fills less than half
+    # (H / factor, W / factor) mean over the nearest surface of a block, 0 where it fills less than
+    # half
+    averaged: Floats2,
 ):
     for v, u in averaged:
         nearest = 0.0
@@ -53,7 +59,7 @@ def average_inverse_depth(
 @ti.kernel
 def average_color(
     # in:
-    color: Bytes3,       # (H, W, 3) RGB
+    color: Bytes3,  # (H, W, 3) RGB
     factor: ti.i32,
     # out:
     intensity: Floats2,  # (H / factor, W / factor) in [0, 1], Rec. 601 luma
@@ -71,11 +77,15 @@ def average_intensity(
     # in:
     intensity: Floats2,  # (H, W)
     # out:
-    averaged: Floats2,   # (H / 2, W / 2)
+    averaged: Floats2,  # (H / 2, W / 2)
 ):
     for v, u in averaged:
-        averaged[v, u] = 0.25 * (intensity[2 * v, 2 * u] + intensity[2 * v, 2 * u + 1] + intensity[2 * v + 1, 2 * u]
-                                 + intensity[2 * v + 1, 2 * u + 1])
+        averaged[v, u] = 0.25 * (
+            intensity[2 * v, 2 * u]
+            + intensity[2 * v, 2 * u + 1]
+            + intensity[2 * v + 1, 2 * u]
+            + intensity[2 * v + 1, 2 * u + 1]
+        )
 
 
 @ti.func
@@ -93,11 +103,11 @@ def sobel(image: ti.template(), v: ti.i32, u: ti.i32):
 @ti.kernel
 def pack_surfels(
     # in:
-    inverse: Floats2,    # (H, W) [1/m], 0: none
-    normals: Floats3,    # (H, W, 3) unit, towards the camera; zero: none
+    inverse: Floats2,  # (H, W) [1/m], 0: none
+    normals: Floats3,  # (H, W, 3) unit, towards the camera; zero: none
     intensity: Floats2,  # (H, W)
     # out:
-    surfels: Floats3,    # (H, W, CHANNELS) depth 0 where there is no reading or no normal
+    surfels: Floats3,  # (H, W, CHANNELS) depth 0 where there is no reading or no normal
 ):
     for v, u in inverse:
         q = inverse[v, u]
@@ -105,7 +115,11 @@ def pack_surfels(
         for d in ti.static(range(3)):
             surfels[v, u, NORMAL + d] = normals[v, u, d]
         along_u, along_v = sobel(intensity, v, u)
-        surfels[v, u, INTENSITY], surfels[v, u, SLOPE_U], surfels[v, u, SLOPE_V] = intensity[v, u], along_u, along_v
+        surfels[v, u, INTENSITY], surfels[v, u, SLOPE_U], surfels[v, u, SLOPE_V] = (
+            intensity[v, u],
+            along_u,
+            along_v,
+        )
         surfels[v, u, CHANNELS - 1] = 0.0
 
 
@@ -122,8 +136,12 @@ def axial_variance(z: ti.f32) -> ti.f32:
 
 
 @ti.func
-def add_row(weight: ti.f32, slope: ti.template(), p: ti.template(), residual: ti.f32, total: ti.template()):
-    """Add one residual with d residual / d p = slope: its row of the Jacobian by a left perturbation is (slope, p x slope)."""
+def add_row(
+    weight: ti.f32, slope: ti.template(), p: ti.template(), residual: ti.f32, total: ti.template()
+):
+    """Add one residual with d residual / d p = slope: its row of the Jacobian by a left
+    perturbation is (slope, p x slope).
+    """
     turn = p.cross(slope)
     row = ti.Vector([slope[0], slope[1], slope[2], turn[0], turn[1], turn[2]])
     for i in ti.static(range(6)):
@@ -134,13 +152,31 @@ def add_row(weight: ti.f32, slope: ti.template(), p: ti.template(), residual: ti
 
 
 @ti.func
-def add_intensity(intensity: ti.f32, target: ti.template(), i: ti.i32, j: ti.i32, x: ti.f32, y: ti.f32, p: ti.template(),
-                  K: ti.template(), sigma: ti.f32, weight: ti.f32, total: ti.template()):
-    """Add the photometric residual of a point p that projects to (x, y), next to target pixel (i, j)."""
+def add_intensity(
+    intensity: ti.f32,
+    target: ti.template(),
+    i: ti.i32,
+    j: ti.i32,
+    x: ti.f32,
+    y: ti.f32,
+    p: ti.template(),
+    K: ti.template(),
+    sigma: ti.f32,
+    weight: ti.f32,
+    total: ti.template(),
+):
+    """Add the photometric residual of a point p that projects to (x, y), next to target pixel (i,
+    j).
+    """
     along_u, along_v = target[i, j, SLOPE_U], target[i, j, SLOPE_V]
     if along_u * along_u + along_v * along_v > LEAST_SLOPE * LEAST_SLOPE:
         e = target[i, j, INTENSITY] + along_u * (x - j) + along_v * (y - i) - intensity
-        slope = ti.Vector([along_u * K[0], along_v * K[1], -(along_u * (x - K[2]) + along_v * (y - K[3]))]) / p[2]
+        slope = (
+            ti.Vector(
+                [along_u * K[0], along_v * K[1], -(along_u * (x - K[2]) + along_v * (y - K[3]))]
+            )
+            / p[2]
+        )
         w = (FREEDOM + 1.0) / (FREEDOM + e * e / (sigma * sigma))
         total[COLORED] += 1.0
         total[PHOTOMETRIC_SCALE] += w * e * e
@@ -148,9 +184,21 @@ def add_intensity(intensity: ti.f32, target: ti.template(), i: ti.i32, j: ti.i32
 
 
 @ti.func
-def add_pixel(source: ti.template(), v: ti.i32, u: ti.i32, target: ti.template(), K_source: ti.template(),
-              K_target: ti.template(), R: ti.template(), t: ti.template(), limits: ti.template(), total: ti.template()):
-    """Associate one source surfel by projection and add its residuals; limits as in `sum_normal_equations`."""
+def add_pixel(
+    source: ti.template(),
+    v: ti.i32,
+    u: ti.i32,
+    target: ti.template(),
+    K_source: ti.template(),
+    K_target: ti.template(),
+    R: ti.template(),
+    t: ti.template(),
+    limits: ti.template(),
+    total: ti.template(),
+):
+    """Associate one source surfel by projection and add its residuals; limits as in
+    `sum_normal_equations`.
+    """
     z = source[v, u, DEPTH]
     total[SOURCE] += 1.0
     p = R @ unprojected(u, v, z, K_source) + t
@@ -172,22 +220,36 @@ def add_pixel(source: ti.template(), v: ti.i32, u: ti.i32, target: ti.template()
                 w /= 1.0 + r * r * w / (limits[2] * limits[2])
                 add_row(w, n, p, r, total)
                 if limits[4] > 0:
-                    add_intensity(source[v, u, INTENSITY], target, i, j, x, y, p, K_target, limits[3], limits[4], total)
+                    add_intensity(
+                        source[v, u, INTENSITY],
+                        target,
+                        i,
+                        j,
+                        x,
+                        y,
+                        p,
+                        K_target,
+                        limits[3],
+                        limits[4],
+                        total,
+                    )
 
 
 @ti.kernel
 def sum_normal_equations(
     # in:
-    source: Floats3,           # (h, w, CHANNELS)
-    target: Floats3,           # (H, W, CHANNELS)
-    intrinsics: Floats2,       # (2, 4) fx fy cx cy of source and target
+    source: Floats3,  # (h, w, CHANNELS)
+    target: Floats3,  # (H, W, CHANNELS)
+    intrinsics: Floats2,  # (2, 4) fx fy cx cy of source and target
     T_target_source: Floats2,  # (3, 4)
-    step: ti.i32,              # every step-th pixel of every step-th row of the source is used
-    limits: Floats1,  # (5,): gate, farthest distance of an inlier from the target's plane [m]; smallest cosine between normals;
-                      # distance [standard deviations] that counts half; scale of intensity residuals; weight of a squared
-                      # intensity residual against a squared distance, both in standard deviations (0: geometry alone)
-    # out:
-    sums: Floats2,             # (blocks, SUMS) a row for every BLOCK_ROWS used source rows
+    step: ti.i32,  # every step-th pixel of every step-th row of the source is used
+    # (5,): gate, farthest distance of an inlier from the target's plane [m]; smallest cosine
+    # between normals;
+    limits: Floats1,
+    # distance [standard deviations] that counts half; scale of intensity residuals; weight of a
+    # squared intensity residual against a squared distance, both in standard deviations (0:
+    # geometry alone) out:
+    sums: Floats2,  # (blocks, SUMS) a row for every BLOCK_ROWS used source rows
 ):
     K_source = ti.Vector([intrinsics[0, k] for k in range(4)])
     K_target = ti.Vector([intrinsics[1, k] for k in range(4)])
@@ -201,6 +263,17 @@ def sum_normal_equations(
             for row in range(block * BLOCK_ROWS, ti.min((block + 1) * BLOCK_ROWS, rows)):
                 for column in range(columns):
                     if source[row * step, column * step, DEPTH] > 0:
-                        add_pixel(source, row * step, column * step, target, K_source, K_target, R, t, limits, total)
+                        add_pixel(
+                            source,
+                            row * step,
+                            column * step,
+                            target,
+                            K_source,
+                            K_target,
+                            R,
+                            t,
+                            limits,
+                            total,
+                        )
             for k in range(SUMS):
                 sums[block, k] = total[k]

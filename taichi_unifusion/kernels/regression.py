@@ -1,11 +1,13 @@
 """The l x l regression of every touched voxel (Eq. 6, 17 and 18).
 
-`F = (P^T W P + d I)^-1 P^T W Y` is Eq. 6 in its primal form: P holds a row f_posi(t) for every sample in the doubled voxel, W
-the number of points behind it. The targets Y ride along as further rows of P^T, so that one Gram product gives both
-P^T W P and Y^T W P, and the forward half of the solve falls out of the Cholesky factorisation.
+`F = (P^T W P + d I)^-1 P^T W Y` is Eq. 6 in its primal form: P holds a row f_posi(t) for every
+sample in the doubled voxel, W the number of points behind it. The targets Y ride along as further
+rows of P^T, so that one Gram product gives both P^T W P and Y^T W P, and the forward half of the
+solve falls out of the Cholesky factorisation.
 
-Sizes are multiples of 4 (`size` for l, `rows` for l plus targets; padding is zero): everything runs in 4x4 patches that stay
-in registers. A *worker* is a thread with a scratch tile of its own that takes a run of voxels.
+Sizes are multiples of 4 (`size` for l, `rows` for l plus targets; padding is zero): everything runs
+in 4x4 patches that stay in registers. A *worker* is a thread with a scratch tile of its own that
+takes a run of voxels.
 """
 
 import taichi as ti
@@ -26,9 +28,11 @@ def neighbor_step(o: ti.i32):
 @ti.kernel
 def find_neighbors(
     # in:
-    stamp: ti.template(), block: ti.template(), frame: ti.i32,
+    stamp: ti.template(),
+    block: ti.template(),
+    frame: ti.i32,
     blocks: ti.i32,
-    keys: Ints2,       # (B, 3)
+    keys: Ints2,  # (B, 3)
     # out:
     neighbors: Ints2,  # (B, 27) block number of each neighbour, -1 where this frame does not touch it
 ):
@@ -40,7 +44,11 @@ def find_neighbors(
         for o in range(13):  # the other half of them, seen from the other side
             ijk = row3(keys, b) + neighbor_step(o)
             found = -1
-            if ijk.min() >= -INDEX_HALF and ijk.max() < INDEX_HALF and stamp[ijk + INDEX_HALF] == frame:
+            if (
+                ijk.min() >= -INDEX_HALF
+                and ijk.max() < INDEX_HALF
+                and stamp[ijk + INDEX_HALF] == frame
+            ):
                 found = block[ijk + INDEX_HALF]
                 neighbors[found, 26 - o] = b
             neighbors[b, o] = found
@@ -48,14 +56,25 @@ def find_neighbors(
 
 @ti.func
 def cell_row(cell: ti.i32, step: ti.template()) -> ti.i32:
-    """Row in the feature table of a neighbour's cell: its place among the 8^3 cells of the doubled voxel."""
+    """Row in the feature table of a neighbour's cell: its place among the 8^3 cells of the doubled
+    voxel.
+    """
     cube = ti.Vector([cell >> 4, cell >> 2 & 3, cell & 3]) + CELLS * step + CELLS // 2
     return (cube[0] << 6) + (cube[1] << 3) + cube[2]
 
 
 @ti.func
-def add_tile(size: ti.template(), rows: ti.template(), worker: ti.i32, filled: ti.i32, tiles: ti.template(), G: ti.template()):
-    """G += P W P^T over the `filled` samples in a worker's tile, whose columns are zero up to the next multiple of 16."""
+def add_tile(
+    size: ti.template(),
+    rows: ti.template(),
+    worker: ti.i32,
+    filled: ti.i32,
+    tiles: ti.template(),
+    G: ti.template(),
+):
+    """G += P W P^T over the `filled` samples in a worker's tile, whose columns are zero up to the
+    next multiple of 16.
+    """
     length = (filled + 15) // 16 * 16
     for i in range(rows // PATCH):
         for j in range(ti.min(i + 1, size // PATCH)):
@@ -63,15 +82,26 @@ def add_tile(size: ti.template(), rows: ti.template(), worker: ti.i32, filled: t
             for k in range(length):
                 for a in ti.static(range(PATCH)):
                     for b in ti.static(range(PATCH)):
-                        sums[a * PATCH + b] += tiles[worker, i * PATCH + a, k] * tiles[worker, j * PATCH + b, k]
+                        sums[a * PATCH + b] += (
+                            tiles[worker, i * PATCH + a, k] * tiles[worker, j * PATCH + b, k]
+                        )
             for a in ti.static(range(PATCH)):
                 for b in ti.static(range(PATCH)):
                     G[(i * PATCH + a) * size + j * PATCH + b] += sums[a * PATCH + b]
 
 
 @ti.func
-def flush(size: ti.template(), rows: ti.template(), worker: ti.i32, filled: ti.i32, tiles: ti.template(), G: ti.template()):
-    """Add what a worker's tile holds to G, first clearing the columns that round it up to a multiple of 16."""
+def flush(
+    size: ti.template(),
+    rows: ti.template(),
+    worker: ti.i32,
+    filled: ti.i32,
+    tiles: ti.template(),
+    G: ti.template(),
+):
+    """Add what a worker's tile holds to G, first clearing the columns that round it up to a
+    multiple of 16.
+    """
     for row in range(rows):
         for k in range(filled, (filled + 15) // 16 * 16):
             tiles[worker, row, k] = 0.0
@@ -79,8 +109,12 @@ def flush(size: ti.template(), rows: ti.template(), worker: ti.i32, filled: ti.i
 
 
 @ti.func
-def cholesky_solve(size: ti.template(), rows: ti.template(), width: ti.template(), noise: ti.f32, G: ti.template()):
-    """Solve (G + noise I) F = R, where R^T stands in the `width` rows of G below its first `size`; F^T replaces it."""
+def cholesky_solve(
+    size: ti.template(), rows: ti.template(), width: ti.template(), noise: ti.f32, G: ti.template()
+):
+    """Solve (G + noise I) F = R, where R^T stands in the `width` rows of G below its first `size`;
+    F^T replaces it.
+    """
     for J in range(size // PATCH):
         for I in range(J, rows // PATCH):
             s = ti.Vector([0.0] * (PATCH * PATCH))
@@ -90,7 +124,9 @@ def cholesky_solve(size: ti.template(), rows: ti.template(), width: ti.template(
             for k in range(PATCH * J):
                 for a in ti.static(range(PATCH)):
                     for b in ti.static(range(PATCH)):
-                        s[a * PATCH + b] -= G[(I * PATCH + a) * size + k] * G[(J * PATCH + b) * size + k]
+                        s[a * PATCH + b] -= (
+                            G[(I * PATCH + a) * size + k] * G[(J * PATCH + b) * size + k]
+                        )
             if I == J:  # factor the patch; its diagonal keeps the inverse pivots
                 for c in ti.static(range(PATCH)):
                     pivot = s[c * PATCH + c] + noise
@@ -105,7 +141,9 @@ def cholesky_solve(size: ti.template(), rows: ti.template(), width: ti.template(
                 for c in ti.static(range(PATCH)):
                     for a in ti.static(range(PATCH)):
                         for k in ti.static(range(c)):
-                            s[a * PATCH + c] -= s[a * PATCH + k] * G[(J * PATCH + c) * size + J * PATCH + k]
+                            s[a * PATCH + c] -= (
+                                s[a * PATCH + k] * G[(J * PATCH + c) * size + J * PATCH + k]
+                            )
                         s[a * PATCH + c] *= G[(J * PATCH + c) * size + J * PATCH + c]
             for a in ti.static(range(PATCH)):
                 for b in ti.static(range(PATCH)):
@@ -125,13 +163,25 @@ def cholesky_solve(size: ti.template(), rows: ti.template(), width: ti.template(
 @ti.func
 def solve_voxel(
     # in:
-    v: ti.i32, rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
-    noise: ti.f32, weight: ti.f32, mean: ti.template(), G: ti.template(),
+    v: ti.i32,
+    rank: ti.template(),
+    size: ti.template(),
+    rows: ti.template(),
+    channels: ti.template(),
+    centered: ti.template(),
+    noise: ti.f32,
+    weight: ti.f32,
+    mean: ti.template(),
+    G: ti.template(),
     # out:
-    latents: ti.template(), weights: ti.template(),
+    latents: ti.template(),
+    weights: ti.template(),
 ):
-    """F of one voxel from its Gram matrix; with a prior mean m, regress y - m and keep m as one more row."""
-    if ti.static(centered):  # P^T W (Y - 1 m) = R - (P^T W 1) m; the row of ones follows the targets
+    """F of one voxel from its Gram matrix; with a prior mean m, regress y - m and keep m as one
+    more row.
+    """
+    # P^T W (Y - 1 m) = R - (P^T W 1) m; the row of ones follows the targets
+    if ti.static(centered):
         for c in ti.static(range(channels)):
             mean[c] /= weight
         for a in range(size):
@@ -150,12 +200,20 @@ def solve_voxel(
 @ti.func
 def keep_sums(
     # in:
-    v: ti.i32, size: ti.template(), channels: ti.template(), centered: ti.template(), weight: ti.f32, mean: ti.template(),
+    v: ti.i32,
+    size: ti.template(),
+    channels: ti.template(),
+    centered: ti.template(),
+    weight: ti.f32,
+    mean: ti.template(),
     G: ti.template(),
     # out:
-    sums: ti.template(), weights: ti.template(),
+    sums: ti.template(),
+    weights: ti.template(),
 ):
-    """What the regression of one voxel sums over its samples, in one row: P^T W P's lower half, Y^T W P, 1^T W P, Y^T W 1."""
+    """What the regression of one voxel sums over its samples, in one row: P^T W P's lower half, Y^T
+    W P, 1^T W P, Y^T W 1.
+    """
     k = 0
     for i in range(size):
         for j in range(i + 1):
@@ -172,26 +230,32 @@ def keep_sums(
 @ti.kernel
 def encode_cells(
     # in:
-    rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
+    rank: ti.template(),
+    size: ti.template(),
+    rows: ti.template(),
+    channels: ti.template(),
+    centered: ti.template(),
     derivatives: ti.template(),
     solve: ti.template(),  # for F; else leave the sums, for `fuse_information`
     blocks: ti.i32,
-    neighbors: Ints2,    # (B, 27)
-    masks: Masks2,       # (B, 2) occupied cells
-    window: Masks2,      # (27, 2) cells of each neighbour that count
-    totals: Ints1,       # (B,) points in the block itself
-    starts: Ints1,       # (B,) first row of each block in `cells`
-    cells: Floats2,      # (M, 1 + c [+ 3]) root of the count, then the mean targets, and normals if `derivatives`, times it
-    features: Floats3,   # (8^3, 1 or 4, size) f_posi, and 1/2 df/dt if `derivatives`, at the cell centres of a doubled voxel
-    minimum: ti.i32,     # blocks with fewer points are not encoded
-    noise: ti.f32,       # d of Eq. 6, in units of the kernel's variance
+    neighbors: Ints2,  # (B, 27)
+    masks: Masks2,  # (B, 2) occupied cells
+    window: Masks2,  # (27, 2) cells of each neighbour that count
+    totals: Ints1,  # (B,) points in the block itself
+    starts: Ints1,  # (B,) first row of each block in `cells`
+    cells: Floats2,  # (M, 1 + c [+ 3]) root of the count, then the mean targets, and normals if `derivatives`, times it
+    # (8^3, 1 or 4, size) f_posi, and 1/2 df/dt if `derivatives`, at the cell centres of a doubled
+    # voxel
+    features: Floats3,
+    minimum: ti.i32,  # blocks with fewer points are not encoded
+    noise: ti.f32,  # d of Eq. 6, in units of the kernel's variance
     workers: ti.i32,
-    stride: ti.i32,      # loop iterations a worker: the CPU cuts loops into chunks of at least 512
+    stride: ti.i32,  # loop iterations a worker: the CPU cuts loops into chunks of at least 512
     # out:
     tiles: ti.template(),  # (W, rows, TILE) scratch
-    latents: Floats3,    # (B, l [+ 1], c) F, then the prior mean
-    weights: Floats1,    # (B,) points in the doubled voxel, 0 where not encoded
-    sums: Floats2,       # (B, q) as `keep_sums`
+    latents: Floats3,  # (B, l [+ 1], c) F, then the prior mean
+    weights: Floats1,  # (B,) points in the doubled voxel, 0 where not encoded
+    sums: Floats2,  # (B, q) as `keep_sums`
 ):
     for i in range(workers * stride):
         if i % stride == 0:
@@ -212,7 +276,9 @@ def encode_cells(
                                 while wanted != 0:
                                     k = ti.math.clz(ti.cast(wanted, ti.i32))
                                     wanted ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
-                                    n = first + ti.math.popcnt((occupied >> 1) >> ti.cast(31 - k, ti.u32))
+                                    n = first + ti.math.popcnt(
+                                        (occupied >> 1) >> ti.cast(31 - k, ti.u32)
+                                    )
                                     at = cell_row(half * 32 + k, step)
                                     root = cells[n, 0]
                                     for a in ti.static(range(size)):
@@ -224,10 +290,13 @@ def encode_cells(
                                     if ti.static(centered):
                                         tiles[worker, size + channels, filled] = root
                                     filled += 1
-                                    if ti.static(derivatives):  # Eq. 16: one more row an axis, its target the normal
+                                    # Eq. 16: one more row an axis, its target the normal
+                                    if ti.static(derivatives):
                                         for axis in ti.static(range(3)):
                                             for a in ti.static(range(size)):
-                                                tiles[worker, a, filled] = features[at, 1 + axis, a] * root
+                                                tiles[worker, a, filled] = (
+                                                    features[at, 1 + axis, a] * root
+                                                )
                                             tiles[worker, size, filled] = cells[n, 2 + axis]
                                             filled += 1
                                     weight += root * root
@@ -238,7 +307,20 @@ def encode_cells(
                     if filled > 0:
                         flush(size, rows, worker, filled, tiles, G)
                     if ti.static(solve):
-                        solve_voxel(v, rank, size, rows, channels, centered, noise, weight, mean, G, latents, weights)
+                        solve_voxel(
+                            v,
+                            rank,
+                            size,
+                            rows,
+                            channels,
+                            centered,
+                            noise,
+                            weight,
+                            mean,
+                            G,
+                            latents,
+                            weights,
+                        )
                     else:
                         keep_sums(v, size, channels, centered, weight, mean, G, sums, weights)
 
@@ -246,23 +328,31 @@ def encode_cells(
 @ti.kernel
 def encode_points(
     # in:
-    rank: ti.template(), size: ti.template(), rows: ti.template(), channels: ti.template(), centered: ti.template(),
+    rank: ti.template(),
+    size: ti.template(),
+    rows: ti.template(),
+    channels: ti.template(),
+    centered: ti.template(),
     derivatives: ti.template(),
     solve: ti.template(),
     blocks: ti.i32,
-    keys: Ints2,          # (B, 3)
-    neighbors: Ints2,     # (B, 27)
-    starts: Ints1,        # (B + 1,) first sample of each block
-    samples: Floats2,     # (N, 3) [voxels], sorted by block
-    targets: Floats2,     # (N, c [+ 3]) targets, and normals if `derivatives`
-    anchors: Floats2,     # (3, A)
+    keys: Ints2,  # (B, 3)
+    neighbors: Ints2,  # (B, 27)
+    starts: Ints1,  # (B + 1,) first sample of each block
+    samples: Floats2,  # (N, 3) [voxels], sorted by block
+    targets: Floats2,  # (N, c [+ 3]) targets, and normals if `derivatives`
+    anchors: Floats2,  # (3, A)
     projection: Floats2,  # (l, A)
     scale: ti.f32,
-    minimum: ti.i32,      # doubled voxels with fewer samples are not encoded
+    minimum: ti.i32,  # doubled voxels with fewer samples are not encoded
     noise: ti.f32,
-    workers: ti.i32, stride: ti.i32,
+    workers: ti.i32,
+    stride: ti.i32,
     # out:
-    tiles: ti.template(), latents: Floats3, weights: Floats1, sums: Floats2,  # as encode_cells
+    tiles: ti.template(),
+    latents: Floats3,
+    weights: Floats1,
+    sums: Floats2,  # as encode_cells
 ):
     for i in range(workers * stride):
         if i % stride == 0:
@@ -293,7 +383,9 @@ def encode_points(
                                 filled += 1
                                 if ti.static(derivatives):
                                     for axis in range(3):
-                                        g = position_gradient(t, axis, rank, anchors, projection, scale)
+                                        g = position_gradient(
+                                            t, axis, rank, anchors, projection, scale
+                                        )
                                         for a in ti.static(range(rank)):
                                             tiles[worker, a, filled] = 0.5 * g[a]  # d/dx = 1/2 d/dt
                                         tiles[worker, size, filled] = targets[n, 1 + axis]
@@ -306,6 +398,19 @@ def encode_points(
                     flush(size, rows, worker, filled, tiles, G)
                 if weight >= minimum:
                     if ti.static(solve):
-                        solve_voxel(v, rank, size, rows, channels, centered, noise, weight, mean, G, latents, weights)
+                        solve_voxel(
+                            v,
+                            rank,
+                            size,
+                            rows,
+                            channels,
+                            centered,
+                            noise,
+                            weight,
+                            mean,
+                            G,
+                            latents,
+                            weights,
+                        )
                     else:
                         keep_sums(v, size, channels, centered, weight, mean, G, sums, weights)

@@ -1,33 +1,52 @@
-"""Evidence for the surface and against it: a frame votes in every cell that it sees or sees through.
+"""Evidence for the surface and against it: a frame votes in every cell that it sees or sees
+through.
 
-A regression extrapolates: where a surface ends, its field goes on. What ends it are rays that pass through. Every cell of a
-voxel (its 4^3 quarters) counts the frames that saw surface in it, minus those that read depth behind it.
+A regression extrapolates: where a surface ends, its field goes on. What ends it are rays that pass
+through. Every cell of a voxel (its 4^3 quarters) counts the frames that saw surface in it, minus
+those that read depth behind it.
 """
 
 import taichi as ti
 
 from .cells import cell_center
-from .voxels import BLOCK_CELLS, CELLS, INDEX_HALF, Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, row3, voxel_of
+from .voxels import (
+    BLOCK_CELLS,
+    CELLS,
+    INDEX_HALF,
+    Floats1,
+    Floats2,
+    Floats3,
+    Ints1,
+    Ints2,
+    Masks2,
+    row3,
+    voxel_of,
+)
 
 Votes2 = ti.types.ndarray(dtype=ti.i8, ndim=2)
 
-MOST_VOTES = 127       # votes that a cell can hold, for or against
-SLACK_VOXELS = 0.5     # a reading this far behind a point passes through it [voxels]...
-SLACK_NOISE = 0.003    # ...plus this much [1/m] times its depth squared: two sigma of a Kinect
-GRAZING = 0.1          # cosine; rays flatter on a surface than this cannot say that they pass through it
-ALONE = 0.45           # the surface of a cell lies within this distance of its centre [voxels]
-LEAST_TENT = 1e-6      # of the cells around a point; with less they say nothing
-FLAT = 0.2             # a field with a smaller slope than this has no surface to speak of
+MOST_VOTES = 127  # votes that a cell can hold, for or against
+SLACK_VOXELS = 0.5  # a reading this far behind a point passes through it [voxels]...
+SLACK_NOISE = 0.003  # ...plus this much [1/m] times its depth squared: two sigma of a Kinect
+GRAZING = 0.1  # cosine; rays flatter on a surface than this cannot say that they pass through it
+ALONE = 0.45  # the surface of a cell lies within this distance of its centre [voxels]
+LEAST_TENT = 1e-6  # of the cells around a point; with less they say nothing
+FLAT = 0.2  # a field with a smaller slope than this has no surface to speak of
 
 
 @ti.func
-def read_behind(p: ti.template(), depth: ti.template(), fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32):
-    """How far behind p [m, camera] the reading of its pixel lies [m], and whether there is a reading."""
+def read_behind(
+    p: ti.template(), depth: ti.template(), fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32
+):
+    """How far behind p [m, camera] the reading of its pixel lies [m], and whether there is a
+    reading.
+    """
     behind, known = 0.0, False
     if p[2] > 0:
         per_depth = 1.0 / p[2]
         u, v = p[0] * per_depth * fx + cx + 0.5, p[1] * per_depth * fy + cy + 0.5
-        if u >= 0 and v >= 0 and u < depth.shape[1] and v < depth.shape[0]:  # before the cast, which could overflow
+        # before the cast, which could overflow
+        if u >= 0 and v >= 0 and u < depth.shape[1] and v < depth.shape[0]:
             reading = depth[ti.cast(v, ti.i32), ti.cast(u, ti.i32)]
             behind, known = reading - p[2], reading > 0
     return behind, known
@@ -35,7 +54,9 @@ def read_behind(p: ti.template(), depth: ti.template(), fx: ti.f32, fy: ti.f32, 
 
 @ti.func
 def cell_surface(rank: ti.template(), F: ti.template(), cell: ti.i32, features: ti.template()):
-    """The point of the surface nearest to a cell's centre [voxels from the voxel's corner], its normal, and if there is one."""
+    """The point of the surface nearest to a cell's centre [voxels from the voxel's corner], its
+    normal, and if there is one.
+    """
     value, slope = 0.0, ti.Vector([0.0, 0.0, 0.0])
     for a in range(rank):
         value += features[cell, 0, a] * F[a]
@@ -55,8 +76,18 @@ def add_votes(evidence: ti.template(), s: ti.i32, cell: ti.i32, votes: ti.i32):
 
 
 @ti.func
-def seen_beside(p: ti.template(), slack: ti.f32, depth: ti.template(), fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32):
-    """Whether a pixel beside that of p [m, camera] reads its depth: on glass and dark things, readings come and go."""
+def seen_beside(
+    p: ti.template(),
+    slack: ti.f32,
+    depth: ti.template(),
+    fx: ti.f32,
+    fy: ti.f32,
+    cx: ti.f32,
+    cy: ti.f32,
+):
+    """Whether a pixel beside that of p [m, camera] reads its depth: on glass and dark things,
+    readings come and go.
+    """
     seen = False
     u, v = p[0] / p[2] * fx + cx + 0.5, p[1] / p[2] * fy + cy + 0.5
     if u >= 1 and v >= 1 and u < depth.shape[1] - 1 and v < depth.shape[0] - 1:
@@ -67,12 +98,23 @@ def seen_beside(p: ti.template(), slack: ti.f32, depth: ti.template(), fx: ti.f3
 
 
 @ti.func
-def surface_vote(p: ti.template(), normal: ti.template(), voxel_size: ti.f32, depth: ti.template(),
-                 fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32):
-    """1 where a reading saw a point p of the surface [m, camera], -1 where it passed through, else 0."""
+def surface_vote(
+    p: ti.template(),
+    normal: ti.template(),
+    voxel_size: ti.f32,
+    depth: ti.template(),
+    fx: ti.f32,
+    fy: ti.f32,
+    cx: ti.f32,
+    cy: ti.f32,
+):
+    """1 where a reading saw a point p of the surface [m, camera], -1 where it passed through, else
+    0.
+    """
     behind, known = read_behind(p, depth, fx, fy, cx, cy)
     cosine = ti.max(ti.abs(normal.dot(p)) / p.norm(), 0.02)
-    pixel = p[2] / fx * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine  # depth across one pixel
+    # depth across one pixel
+    pixel = p[2] / fx * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine
     slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2] + pixel
     vote = 0
     if not known:
@@ -90,25 +132,38 @@ def vote_cells(
     # in:
     rank: ti.template(),
     voxels: ti.i32,
-    keys: Ints2,            # (S, 3)
-    masks: Masks2,          # (S, 2) cells with support
-    latents: Floats3,       # (S, l, 1)
-    features: Floats3,      # (64, 4, l) f_posi and its gradient by voxel units at the cells' centres
+    keys: Ints2,  # (S, 3)
+    masks: Masks2,  # (S, 2) cells with support
+    latents: Floats3,  # (S, l, 1)
+    features: Floats3,  # (64, 4, l) f_posi and its gradient by voxel units at the cells' centres
     voxel_size: ti.f32,
-    depth: Floats2,         # (H, W) [m], 0: no reading
-    fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32,
+    depth: Floats2,  # (H, W) [m], 0: no reading
+    fx: ti.f32,
+    fy: ti.f32,
+    cx: ti.f32,
+    cy: ti.f32,
     T_camera_world: Floats2,  # (3, 4)
-    sign: ti.i32,           # 1; -1 takes the frame's votes back
+    sign: ti.i32,  # 1; -1 takes the frame's votes back
     # out:
-    evidence: Votes2,       # (S, 64) += 1 where the frame saw the cell's surface, -= 1 where it saw through the cell
+    evidence: Votes2,  # (S, 64) += 1 where the frame saw the cell's surface, -= 1 where it saw through the cell
 ):
     for s in range(voxels):
-        R = ti.Matrix([[T_camera_world[i, j] * voxel_size for j in range(3)] for i in range(3)])  # world [voxels] -> camera [m]
+        # world [voxels] -> camera [m]
+        R = ti.Matrix([[T_camera_world[i, j] * voxel_size for j in range(3)] for i in range(3)])
         corner = R @ row3(keys, s) + ti.Vector([T_camera_world[i, 3] for i in ti.static(range(3))])
         center = corner + R @ ti.Vector([0.5, 0.5, 0.5])
-        z, around = ti.max(center[2], 1e-3), 1.5 * voxel_size * ti.max(fx, fy) / ti.max(center[2] - voxel_size, 1e-3)
-        u, v = center[0] / z * fx + cx, center[1] / z * fy + cy  # what votes lies within a voxel's edge of its centre
-        in_image = u > -around and v > -around and u < depth.shape[1] + around and v < depth.shape[0] + around
+        z, around = (
+            ti.max(center[2], 1e-3),
+            1.5 * voxel_size * ti.max(fx, fy) / ti.max(center[2] - voxel_size, 1e-3),
+        )
+        # what votes lies within a voxel's edge of its centre
+        u, v = center[0] / z * fx + cx, center[1] / z * fy + cy
+        in_image = (
+            u > -around
+            and v > -around
+            and u < depth.shape[1] + around
+            and v < depth.shape[0] + around
+        )
         if center[2] > -voxel_size and in_image:
             F = ti.Vector([0.0] * rank)
             for a in range(rank):
@@ -124,7 +179,16 @@ def vote_cells(
                 else:
                     x, normal, found = cell_surface(rank, F, cell, features)
                     if found:
-                        vote = surface_vote(corner + R @ x, R @ normal / voxel_size, voxel_size, depth, fx, fy, cx, cy)
+                        vote = surface_vote(
+                            corner + R @ x,
+                            R @ normal / voxel_size,
+                            voxel_size,
+                            depth,
+                            fx,
+                            fy,
+                            cx,
+                            cy,
+                        )
                 if vote != 0:
                     add_votes(evidence, s, cell, sign * vote)
 
@@ -133,12 +197,12 @@ def vote_cells(
 def vote_support(
     # in:
     blocks: ti.i32,
-    keys: Ints2,            # (B, 3)
-    support: Masks2,        # (B, 2) cells that the frame supports
+    keys: Ints2,  # (B, 3)
+    support: Masks2,  # (B, 2) cells that the frame supports
     slot: ti.template(),
     sign: ti.i32,
     # out:
-    evidence: Votes2,       # (S, 64) += 1 where the frame supports the cell: it has no rays to ask
+    evidence: Votes2,  # (S, 64) += 1 where the frame supports the cell: it has no rays to ask
 ):
     for b, cell in ti.ndrange(blocks, BLOCK_CELLS):
         s = slot[row3(keys, b) + INDEX_HALF] - 1
@@ -149,8 +213,8 @@ def vote_support(
 @ti.kernel
 def add_evidence(
     # in:
-    slots: Ints1,          # (N,)
-    evidence: Votes2,      # (N, 64)
+    slots: Ints1,  # (N,)
+    evidence: Votes2,  # (N, 64)
     # out:
     map_evidence: Votes2,  # (S, 64) += evidence
 ):
@@ -161,13 +225,15 @@ def add_evidence(
 @ti.kernel
 def interpolate_evidence(
     # in:
-    points: Floats2,     # (N, 3) world [m]
+    points: Floats2,  # (N, 3) world [m]
     per_meter: ti.f32,
     slot: ti.template(),
-    masks: Masks2,       # (S, 2)
-    evidence: Votes2,    # (S, 64)
+    masks: Masks2,  # (S, 2)
+    evidence: Votes2,  # (S, 64)
     # out:
-    values: Floats1,     # (N,) between the cells around that have support or are seen through; 1 where none is, as if seen once
+    # (N,) between the cells around that have support or are seen through; 1 where none is, as if
+    # seen once
+    values: Floats1,
 ):
     for n in range(points.shape[0]):
         x = row3(points, n) * (per_meter * CELLS) - 0.5

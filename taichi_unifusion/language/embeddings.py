@@ -21,14 +21,18 @@ from . import unit_length
 
 @dataclass(frozen=True)
 class TextEmbeddings:
-    """Names and their vectors; a name is found however it is capitalised, with spaces or underscores, without its (remark)."""
+    """Names and their vectors; a name is found however it is capitalised, with spaces or
+    underscores, without its (remark).
+    """
 
     name: str
     names: tuple[str, ...]
     vectors: NDArray[np.float32]  # (n, c) unit length
 
     def text_features(self, texts: Sequence[str]) -> NDArray[np.float32]:
-        """(m, c) of the texts; raises InputError, with the nearest names, for one that the file does not hold."""
+        """(m, c) of the texts; raises InputError, with the nearest names, for one that the file
+        does not hold.
+        """
         return self.vectors[[self._row(text) for text in texts]]
 
     def _row(self, text: str) -> int:
@@ -37,12 +41,17 @@ class TextEmbeddings:
             if plain(text) in rows:
                 return rows[plain(text)]
         near = difflib.get_close_matches(_plain(text), [_plain(name) for name in self.names], n=3)
-        raise InputError(f"{self.name}: has no vector for '{text}'" + (f", did you mean {' or '.join(near)}?" if near else ".")
-                         + f" It holds {len(self.names)} names; with a text encoder any text can be asked")
+        raise InputError(
+            f"{self.name}: has no vector for '{text}'"
+            + (f", did you mean {' or '.join(near)}?" if near else ".")
+            + f" It holds {len(self.names)} names; with a text encoder any text can be asked"
+        )
 
     def has(self, text: str) -> bool:
         """Whether there is a vector for the text."""
-        return _plain(text) in {_plain(name) for name in self.names} | {_bare(name) for name in self.names}
+        return _plain(text) in {_plain(name) for name in self.names} | {
+            _bare(name) for name in self.names
+        }
 
     @property
     def anything(self) -> NDArray[np.float32]:
@@ -51,10 +60,12 @@ class TextEmbeddings:
 
 
 def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> TextEmbeddings:
-    """Read `.npz` with arrays `names` (n,) and `vectors` (n, c), or `.npy` (n, c) with the names in another file.
+    """Read `.npz` with arrays `names` (n,) and `vectors` (n, c), or `.npy` (n, c) with the names in
+    another file.
 
-    `names`: .txt with one a line, .csv with them in its last column, or .json with a list of texts or of objects with "name";
-    the file beside the vectors with one of these suffixes without it. Raises FileError, InputError where they do not fit.
+    `names`: .txt with one a line, .csv with them in its last column, or .json with a list of texts
+    or of objects with "name"; the file beside the vectors with one of these suffixes without it.
+    Raises FileError, InputError where they do not fit.
     """
     path = Path(file)
     if path.suffix == ".npz":
@@ -64,8 +75,10 @@ def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> Tex
         try:
             listed, vectors = [str(name) for name in arrays["names"]], arrays["vectors"]
         except ValueError:
-            raise InputError(f"{path}: its names are Python objects, which can run code; save them as an array of "
-                             "text") from None
+            raise InputError(
+                f"{path}: its names are Python objects, which can run code; save them as an array of "
+                "text"
+            ) from None
     else:
         vectors = _load(path)
         beside = [path.with_suffix(suffix) for suffix in (".txt", ".json", ".csv")]
@@ -73,8 +86,15 @@ def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> Tex
         if found is None:
             raise FileError(f"{path}: give the file of its names, with --names")
         listed = _read_names(found)
-    if vectors.ndim != 2 or vectors.dtype.kind != "f" or len(vectors) != len(listed) or not len(listed):
-        raise InputError(f"{path}: expected one vector a name, got {vectors.shape} {vectors.dtype} for {len(listed)} names")
+    if (
+        vectors.ndim != 2
+        or vectors.dtype.kind != "f"
+        or len(vectors) != len(listed)
+        or not len(listed)
+    ):
+        raise InputError(
+            f"{path}: expected one vector a name, got {vectors.shape} {vectors.dtype} for {len(listed)} names"
+        )
     vectors = unit_length(vectors)
     if not np.isfinite(vectors).all():
         bad = listed[int(np.argmin(np.isfinite(vectors).all(axis=1)))]
@@ -88,19 +108,28 @@ def _load(path: Path):
     except (ValueError, EOFError, OSError) as error:
         if isinstance(error, FileError):
             raise
-        raise FileError(f"{path}: not arrays that NumPy wrote, or a damaged file ({str(error)[:120]})") from None
+        raise FileError(
+            f"{path}: not arrays that NumPy wrote, or a damaged file ({str(error)[:120]})"
+        ) from None
 
 
 def _read_names(path: Path) -> list[str]:
     try:
         text = read_bytes(path).decode("utf-8-sig")
         if path.suffix == ".json":
-            return [entry["name"] if isinstance(entry, dict) else str(entry) for entry in json.loads(text)]
+            return [
+                entry["name"] if isinstance(entry, dict) else str(entry)
+                for entry in json.loads(text)
+            ]
         if path.suffix == ".csv":
             return [row[-1] for row in csv.reader(text.splitlines()) if row]
-        return [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+        return [
+            line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")
+        ]
     except (ValueError, KeyError, TypeError) as error:
-        raise FileError(f"{path}: not a list of names ({type(error).__name__}: {str(error)[:120]})") from None
+        raise FileError(
+            f"{path}: not a list of names ({type(error).__name__}: {str(error)[:120]})"
+        ) from None
 
 
 def _plain(name: str) -> str:

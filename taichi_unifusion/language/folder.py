@@ -1,4 +1,6 @@
-"""Features computed before, by any program: one file a frame, read in strips and made small on the way."""
+"""Features computed before, by any program: one file a frame, read in strips and made small on the
+way.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,9 @@ from ..types import Frame
 from . import unit_length
 
 SUFFIXES = (".npy", ".npz", ".pt")
-LONGEST_SIDE = 96           # pixels of a feature image; more only repeats what the networks made
-USUAL_CHANNELS = (512, 640, 768, 1024, 1152, 1280)  # of image-text networks, to tell (h, w, c) from (c, h, w)
+LONGEST_SIDE = 96  # pixels of a feature image; more only repeats what the networks made
+# of image-text networks, to tell (h, w, c) from (c, h, w)
+USUAL_CHANNELS = (512, 640, 768, 1024, 1152, 1280)
 MAX_SIDE, MAX_CHANNELS = 16384, 8192
 NUMBERS = re.compile(r"\d+")
 
@@ -29,11 +32,13 @@ class FolderFeatures:
     """Features of frames by the frame's file name, or by its number."""
 
     name: str
-    files: dict[str, Path]   # by stem
+    files: dict[str, Path]  # by stem
     layout: Literal["auto", "hwc", "chw"] = "auto"
 
     def image_features(self, frame: Frame) -> NDArray[np.float32]:
-        """(h, w, c) unit length, no larger than LONGEST_SIDE; raises FrameError where there is no file or it is damaged."""
+        """(h, w, c) unit length, no larger than LONGEST_SIDE; raises FrameError where there is no
+        file or it is damaged.
+        """
         stem = Path(frame.name).stem
         path = self.files.get(stem) or self._by_number(stem, frame.index)
         if path is None:
@@ -47,10 +52,14 @@ class FolderFeatures:
         found = NUMBERS.findall(stem)
         wanted = int(found[-1]) if found else index
         numbered = ((NUMBERS.findall(other), path) for other, path in self.files.items())
-        return next((path for numbers, path in numbered if numbers and int(numbers[-1]) == wanted), None)
+        return next(
+            (path for numbers, path in numbered if numbers and int(numbers[-1]) == wanted), None
+        )
 
 
-def folder_features(folder: str | Path, *, layout: Literal["auto", "hwc", "chw"] = "auto") -> FolderFeatures:
+def folder_features(
+    folder: str | Path, *, layout: Literal["auto", "hwc", "chw"] = "auto"
+) -> FolderFeatures:
     """The feature files in a folder; raises FileError where there are none."""
     folder = Path(folder)
     check_choice("layout", layout, ("auto", "hwc", "chw"))
@@ -63,9 +72,11 @@ def folder_features(folder: str | Path, *, layout: Literal["auto", "hwc", "chw"]
 
 
 def read_features(path: Path, layout: str = "auto") -> NDArray[np.float32]:
-    """Mean features (h, w, c) of the blocks of a stored array (H, W, c) or (c, H, W); at no time is all of it in memory.
+    """Mean features (h, w, c) of the blocks of a stored array (H, W, c) or (c, H, W); at no time is
+    all of it in memory.
 
-    Raises FileError where the file is missing, damaged or would run code, InputError where it holds something else.
+    Raises FileError where the file is missing, damaged or would run code, InputError where it holds
+    something else.
     """
     with _planes(path) as (shape, planes):
         if len(shape) == 4 and shape[0] == 1:
@@ -73,10 +84,14 @@ def read_features(path: Path, layout: str = "auto") -> NDArray[np.float32]:
         if len(shape) != 3 or not all(0 < n <= MAX_SIDE for n in shape):
             raise InputError(f"{path}: features must be (H, W, c) or (c, H, W), got {shape}")
         if layout == "auto":
-            layout = "chw" if shape[0] in USUAL_CHANNELS and shape[2] not in USUAL_CHANNELS else "hwc"
+            layout = (
+                "chw" if shape[0] in USUAL_CHANNELS and shape[2] not in USUAL_CHANNELS else "hwc"
+            )
         height, width, channels = shape if layout == "hwc" else (*shape[1:], shape[0])
         if channels > MAX_CHANNELS:
-            raise InputError(f"{path}: {channels} channels; is the layout another one than {layout}?")
+            raise InputError(
+                f"{path}: {channels} channels; is the layout another one than {layout}?"
+            )
         block = -(-max(height, width) // LONGEST_SIDE)
         h, w = max(height // block, 1), max(width // block, 1)
         small = np.zeros((h, w, channels), np.float32)
@@ -104,7 +119,9 @@ def _block_mean(values: NDArray, count: int) -> NDArray[np.float32]:
 
 @contextmanager
 def _planes(path: Path) -> Iterator[tuple[tuple[int, ...], Iterator[NDArray]]]:
-    """Shape of the one array in a file, and its slices along the first axis, read one after the other."""
+    """Shape of the one array in a file, and its slices along the first axis, read one after the
+    other.
+    """
     try:
         if path.suffix == ".pt":
             array = _open_torch(path)
@@ -131,17 +148,25 @@ def _stream(path: Path, file: BinaryIO) -> tuple[tuple[int, ...], Iterator[NDArr
     """Header and slices of an array in NumPy's format."""
     try:
         version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        read = (
+            np.lib.format.read_array_header_1_0
+            if version == (1, 0)
+            else np.lib.format.read_array_header_2_0
+        )
         shape, fortran, dtype = read(file)
     except ValueError as error:
         raise FileError(f"{path}: not an array that NumPy wrote ({str(error)[:120]})") from None
     if dtype.kind != "f" or fortran:
-        raise InputError(f"{path}: features must be floating-point numbers in C order, got {dtype}"
-                         f"{' in Fortran order' * fortran}; a pickle is never read")
+        raise InputError(
+            f"{path}: features must be floating-point numbers in C order, got {dtype}"
+            f"{' in Fortran order' * fortran}; a pickle is never read"
+        )
     return shape, _slices(path, file, shape, dtype)
 
 
-def _slices(path: Path, file: BinaryIO, shape: tuple[int, ...], dtype: np.dtype) -> Iterator[NDArray]:
+def _slices(
+    path: Path, file: BinaryIO, shape: tuple[int, ...], dtype: np.dtype
+) -> Iterator[NDArray]:
     size = int(np.prod(shape[1:])) * dtype.itemsize
     for _ in range(shape[0]):
         data = file.read(size)
@@ -154,15 +179,21 @@ def _open_torch(path: Path):
     try:
         import torch
     except ImportError:
-        raise MissingDependency(f"{path}: .pt files are read by torch: pip install 'taichi-unifusion[clip]', or save "
-                                ".npy") from None
+        raise MissingDependency(
+            f"{path}: .pt files are read by torch: pip install 'taichi-unifusion[clip]', or save "
+            ".npy"
+        ) from None
     if not path.exists():
         raise FileNotFoundError
     try:
         array = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:  # torch has a class of its own for every kind
         line = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
-        raise FileError(f"{path}: not a tensor that torch reads safely, without running code ({line})") from None
+        raise FileError(
+            f"{path}: not a tensor that torch reads safely, without running code ({line})"
+        ) from None
     if not isinstance(array, torch.Tensor) or not array.is_floating_point():
-        raise InputError(f"{path}: holds {type(array).__name__}, expected one tensor of floating-point numbers")
+        raise InputError(
+            f"{path}: holds {type(array).__name__}, expected one tensor of floating-point numbers"
+        )
     return array.squeeze(0) if array.ndim == 4 and array.shape[0] == 1 else array

@@ -1,4 +1,6 @@
-"""Answers as meshes and pictures: relevance as heat over the grey surface, labels in colours with a legend."""
+"""Answers as meshes and pictures: relevance as heat over the grey surface, labels in colours with a
+legend.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +15,25 @@ from ..rendering.preview import draw_preview
 from ..types import Mesh, Trajectory
 from .questions import UNLABELLED, Segmentation
 
-HEAT = ((0.0, (0.46, 0.46, 0.50)), (0.35, (0.48, 0.30, 0.42)), (0.5, (0.78, 0.26, 0.24)), (0.75, (0.96, 0.60, 0.14)),
-        (1.0, (1.0, 0.92, 0.35)))  # relevance -> RGB: grey where nothing is, bright where it wins
+HEAT = (
+    (0.0, (0.46, 0.46, 0.50)),
+    (0.35, (0.48, 0.30, 0.42)),
+    (0.5, (0.78, 0.26, 0.24)),
+    (0.75, (0.96, 0.60, 0.14)),
+    (1.0, (1.0, 0.92, 0.35)),
+)  # relevance -> RGB: grey where nothing is, bright where it wins
 NOTHING = (0.35, 0.35, 0.35)  # RGB of a vertex without a label
-GOLDEN = 0.618033988749895    # steps of hue that stay apart for any number of labels
-NEAR = 1.0                    # [m] a camera nearer than this shows too little around
-LABEL_CONTRAST = 0.35           # of a labelled surface's own light and dark
-LEGEND_WIDTH = 320              # [pixels]
-SWATCHES = 18, 38               # [pixels] a row of the legend may be high
+GOLDEN = 0.618033988749895  # steps of hue that stay apart for any number of labels
+NEAR = 1.0  # [m] a camera nearer than this shows too little around
+LABEL_CONTRAST = 0.35  # of a labelled surface's own light and dark
+LEGEND_WIDTH = 320  # [pixels]
+SWATCHES = 18, 38  # [pixels] a row of the legend may be high
 
 
 def heat_mesh(mesh: Mesh, relevance: NDArray) -> Mesh:
-    """The mesh in colours of the relevance (V,), with its shades of light and dark; the numbers as attribute `relevance`."""
+    """The mesh in colours of the relevance (V,), with its shades of light and dark; the numbers as
+    attribute `relevance`.
+    """
     levels, colors = np.array([level for level, _ in HEAT]), np.array([color for _, color in HEAT])
     heat = np.stack([np.interp(relevance, levels, colors[:, k]) for k in range(3)], axis=1)
     return _recolored(mesh, heat, 0.6).with_attribute("relevance", relevance)
@@ -39,8 +48,12 @@ def _recolored(mesh: Mesh, colors: NDArray, contrast: float) -> Mesh:
     return Mesh(mesh.vertices, mesh.faces, mesh.normals).with_attribute("color", shaded)
 
 
-def cameras_that_see(trajectory: Trajectory | None, point: NDArray, count: int = 3) -> Trajectory | None:
-    """The poses that have a point (3,) world [m] nearest to the middle of their picture, not too close."""
+def cameras_that_see(
+    trajectory: Trajectory | None, point: NDArray, count: int = 3
+) -> Trajectory | None:
+    """The poses that have a point (3,) world [m] nearest to the middle of their picture, not too
+    close.
+    """
     if trajectory is None or not len(trajectory):
         return trajectory
     T_camera_world = np.linalg.inv(trajectory.T_world_camera)
@@ -53,30 +66,53 @@ def cameras_that_see(trajectory: Trajectory | None, point: NDArray, count: int =
 
 def label_colors(count: int) -> NDArray[np.float64]:
     """(count, 3) RGB in [0, 1] that differ."""
-    return np.array([colorsys.hsv_to_rgb((0.02 + i * GOLDEN) % 1, (0.65, 0.4, 0.8)[i % 3], (0.92, 0.8, 0.62)[i // 3 % 3])
-                     for i in range(count)])
+    return np.array(
+        [
+            colorsys.hsv_to_rgb(
+                (0.02 + i * GOLDEN) % 1, (0.65, 0.4, 0.8)[i % 3], (0.92, 0.8, 0.62)[i // 3 % 3]
+            )
+            for i in range(count)
+        ]
+    )
 
 
 def label_mesh(mesh: Mesh, found: Segmentation, labels: Sequence[int], colors: NDArray) -> Mesh:
-    """The mesh in the colours of its names, with attributes `label`, -1 without one, and `confidence`."""
+    """The mesh in the colours of its names, with attributes `label`, -1 without one, and
+    `confidence`.
+    """
     known = found.labels != UNLABELLED
     shown = np.where(known[:, None], colors[found.labels], np.array(NOTHING))
     numbers = np.where(known, np.array(labels)[found.labels], UNLABELLED)
-    return (_recolored(mesh, shown, LABEL_CONTRAST).with_attribute("label", numbers)
-            .with_attribute("confidence", found.confidence))
+    return (
+        _recolored(mesh, shown, LABEL_CONTRAST)
+        .with_attribute("label", numbers)
+        .with_attribute("confidence", found.confidence)
+    )
 
 
-def segmentation_picture(mesh: Mesh, found: Segmentation, colors: NDArray, trajectory: Trajectory | None) -> NDArray[np.uint8]:
-    """Views of a labelled mesh (H, W, 3) RGB beside the names that occur in it, the commonest first."""
+def segmentation_picture(
+    mesh: Mesh, found: Segmentation, colors: NDArray, trajectory: Trajectory | None
+) -> NDArray[np.uint8]:
+    """Views of a labelled mesh (H, W, 3) RGB beside the names that occur in it, the commonest
+    first.
+    """
     picture = draw_preview(mesh, trajectory=trajectory)
     counts = np.bincount(found.labels[found.labels != UNLABELLED], minlength=len(found.names))
     present = [i for i in np.argsort(-counts, kind="stable") if counts[i]]
     height = picture.shape[0]
     step = int(np.clip(height // (len(present) + 1), *SWATCHES))
     legend = np.full((height, LEGEND_WIDTH, 3), 255, np.uint8)
-    for row, i in enumerate(present[:height // step - 1]):
+    for row, i in enumerate(present[: height // step - 1]):
         top, size = step // 2 + row * step, step * 2 // 3
-        legend[top:top + size, 14:14 + 2 * size] = (255 * colors[i] + 0.5).astype(np.uint8)
-        cv2.putText(legend, found.names[i][:24], (26 + 2 * size, top + size - size // 6), cv2.FONT_HERSHEY_SIMPLEX, size / 32,
-                    (40, 40, 40), 1, cv2.LINE_AA)
+        legend[top : top + size, 14 : 14 + 2 * size] = (255 * colors[i] + 0.5).astype(np.uint8)
+        cv2.putText(
+            legend,
+            found.names[i][:24],
+            (26 + 2 * size, top + size - size // 6),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            size / 32,
+            (40, 40, 40),
+            1,
+            cv2.LINE_AA,
+        )
     return np.hstack([picture, legend])

@@ -1,4 +1,6 @@
-"""From words to embeddings: prompt templates, what a query is measured against, and the relevance of a feature to it."""
+"""From words to embeddings: prompt templates, what a query is measured against, and the relevance
+of a feature to it.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +13,52 @@ from ..errors import InputError
 from . import TextEncoder, unit_length
 from .embeddings import TextEmbeddings
 
-TEMPLATES = ("{}", "a {}", "a photo of a {}", "a photo of a {} in a room", "there is a {} in the scene")
-# What a query must beat: words for anything, and what rooms are full of. Those too near to the query drop out.
-NEGATIVES = ("object", "thing", "stuff", "texture", "other", "wall", "floor", "ceiling", "door", "window", "table", "chair",
-             "cabinet", "bed", "sofa", "lamp", "painting", "box", "bag", "book", "shelf", "curtain", "carpet", "plant",
-             "person")
-SYNONYM = 0.9       # cosine of two texts above which one does not compete with the other
+TEMPLATES = (
+    "{}",
+    "a {}",
+    "a photo of a {}",
+    "a photo of a {} in a room",
+    "there is a {} in the scene",
+)
+# What a query must beat: words for anything, and what rooms are full of. Those too near to the
+# query drop out.
+NEGATIVES = (
+    "object",
+    "thing",
+    "stuff",
+    "texture",
+    "other",
+    "wall",
+    "floor",
+    "ceiling",
+    "door",
+    "window",
+    "table",
+    "chair",
+    "cabinet",
+    "bed",
+    "sofa",
+    "lamp",
+    "painting",
+    "box",
+    "bag",
+    "book",
+    "shelf",
+    "curtain",
+    "carpet",
+    "plant",
+    "person",
+)
+SYNONYM = 0.9  # cosine of two texts above which one does not compete with the other
 LOGIT_SCALE = 100.0  # CLIP's own, learned: cosines become logits
 
 
-def embed(encoder: TextEncoder, texts: Sequence[str], templates: Sequence[str] = TEMPLATES) -> NDArray[np.float32]:
-    """Embeddings (n, c) of texts, the mean over the templates; a file of embeddings is asked for the bare names."""
+def embed(
+    encoder: TextEncoder, texts: Sequence[str], templates: Sequence[str] = TEMPLATES
+) -> NDArray[np.float32]:
+    """Embeddings (n, c) of texts, the mean over the templates; a file of embeddings is asked for
+    the bare names.
+    """
     if not texts or not all(text.strip() for text in texts):
         raise InputError("query: a text is empty")
     if isinstance(encoder, TextEmbeddings):
@@ -34,25 +71,43 @@ def embed(encoder: TextEncoder, texts: Sequence[str], templates: Sequence[str] =
     return unit_length(vectors.mean(axis=1))
 
 
-def competitors(encoder: TextEncoder, queries: NDArray[np.float32], negatives: Sequence[str] = (),
-                templates: Sequence[str] = TEMPLATES) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Embeddings (m, c) of what queries (n, c) have to beat, and which of them (n, m) compete with which query.
+def competitors(
+    encoder: TextEncoder,
+    queries: NDArray[np.float32],
+    negatives: Sequence[str] = (),
+    templates: Sequence[str] = TEMPLATES,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Embeddings (m, c) of what queries (n, c) have to beat, and which of them (n, m) compete with
+    which query.
 
-    Those of NEGATIVES, as far as a file of embeddings holds them, beside what all its names have in common; and of `negatives`.
-    One that is nearly the query itself does not compete. Raises InputError where nothing is left.
+    Those of NEGATIVES, as far as a file of embeddings holds them, beside what all its names have in
+    common; and of `negatives`. One that is nearly the query itself does not compete. Raises
+    InputError where nothing is left.
     """
     if isinstance(encoder, TextEmbeddings):
-        usual = np.vstack([encoder.anything, *(encoder.text_features([name]) for name in NEGATIVES if encoder.has(name))])
+        usual = np.vstack(
+            [
+                encoder.anything,
+                *(encoder.text_features([name]) for name in NEGATIVES if encoder.has(name)),
+            ]
+        )
     else:
         usual = embed(encoder, NEGATIVES, templates)
     rivals = np.vstack([usual, embed(encoder, negatives, templates)]) if negatives else usual
     competes = queries @ rivals.T < SYNONYM
     if not competes.any(axis=1).all():
-        raise InputError("query: nothing is left to compare with; give negatives that mean something else")
+        raise InputError(
+            "query: nothing is left to compare with; give negatives that mean something else"
+        )
     return rivals, competes
 
 
-def relevance(similarity: NDArray[np.float32], strongest: NDArray[np.float32],
-              scale: float = LOGIT_SCALE) -> NDArray[np.float32]:
-    """Relevance (N,) in 0..1 of a query: its softmax against the strongest of its rivals, both as cosines; 0.5 is a draw."""
-    return (1 / (1 + np.exp(np.clip(-scale * (similarity - strongest), -80, 80)))).astype(np.float32)
+def relevance(
+    similarity: NDArray[np.float32], strongest: NDArray[np.float32], scale: float = LOGIT_SCALE
+) -> NDArray[np.float32]:
+    """Relevance (N,) in 0..1 of a query: its softmax against the strongest of its rivals, both as
+    cosines; 0.5 is a draw.
+    """
+    return (1 / (1 + np.exp(np.clip(-scale * (similarity - strongest), -80, 80)))).astype(
+        np.float32
+    )

@@ -1,4 +1,6 @@
-"""What is asked of a map of features: the relevance of texts, and the best of a list of names, at the vertices of a mesh."""
+"""What is asked of a map of features: the relevance of texts, and the best of a list of names, at
+the vertices of a mesh.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +27,10 @@ class Answer:
     """What a query found."""
 
     text: str
-    relevance: NDArray[np.float32]   # (V,) 0..1, 0 where the map knows nothing; 0.5 is a draw with the strongest rival
+    # (V,) 0..1, 0 where the map knows nothing; 0.5 is a draw with the strongest rival
+    relevance: NDArray[np.float32]
     similarity: NDArray[np.float32]  # (V,) cosine
-    regions: tuple[Region, ...]      # best first
+    regions: tuple[Region, ...]  # best first
 
     @property
     def found(self) -> bool:
@@ -35,8 +38,17 @@ class Answer:
         return bool(self.regions)
 
 
-def ask(features: LatentMap, mesh: Mesh, encoder: TextEncoder, texts: Sequence[str], *, negatives: Sequence[str] = (),
-        threshold: float = THRESHOLD, min_area: float = MIN_AREA, templates: Sequence[str] = TEMPLATES) -> list[Answer]:
+def ask(
+    features: LatentMap,
+    mesh: Mesh,
+    encoder: TextEncoder,
+    texts: Sequence[str],
+    *,
+    negatives: Sequence[str] = (),
+    threshold: float = THRESHOLD,
+    min_area: float = MIN_AREA,
+    templates: Sequence[str] = TEMPLATES,
+) -> list[Answer]:
     """Answers to texts, each against its rivals (see `competitors`) at the vertices of a mesh.
 
     Raises InputError where the encoder's vectors do not fit the map, or has none for a text.
@@ -45,25 +57,37 @@ def ask(features: LatentMap, mesh: Mesh, encoder: TextEncoder, texts: Sequence[s
     rivals, competes = competitors(encoder, queries, negatives, templates)
     both = np.concatenate([queries, rivals])
     distances = np.where(competes, np.linalg.norm(queries[:, None] - rivals[None], axis=2), np.inf)
-    parts = [_scores(features, mesh.vertices[first:first + POINTS_AT_ONCE], both, distances)
-             for first in range(0, max(len(mesh.vertices), 1), POINTS_AT_ONCE)]
+    parts = [
+        _scores(features, mesh.vertices[first : first + POINTS_AT_ONCE], both, distances)
+        for first in range(0, max(len(mesh.vertices), 1), POINTS_AT_ONCE)
+    ]
     similarity, scores = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    regions = [find_regions(mesh, column, threshold=threshold, min_area=min_area) for column in scores.T]
-    return [Answer(text, scores[:, i], similarity[:, i], tuple(regions[i])) for i, text in enumerate(texts)]
+    regions = [
+        find_regions(mesh, column, threshold=threshold, min_area=min_area) for column in scores.T
+    ]
+    return [
+        Answer(text, scores[:, i], similarity[:, i], tuple(regions[i]))
+        for i, text in enumerate(texts)
+    ]
 
 
-def _scores(features: LatentMap, points: NDArray, both: NDArray, distances: NDArray) -> tuple[NDArray, NDArray]:
-    """Similarity and relevance (N, n) of n queries, which come before their m rivals in `both`, at `distances` (n, m).
+def _scores(
+    features: LatentMap, points: NDArray, both: NDArray, distances: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Similarity and relevance (N, n) of n queries, which come before their m rivals in `both`, at
+    `distances` (n, m).
 
-    A rival that is as near as noise makes it, by SURE standard deviations, counts as nearer: surface
-    that was seldom seen answers seldom.
+    A rival that is as near as noise makes it, by SURE standard deviations, counts as nearer:
+    surface that was seldom seen answers seldom.
     """
     similarity, known = features.similarity(points, both, return_valid=True)
     margin = SURE * features.uncertainty(points)[:, None]
     count, scores = len(distances), []
     for i, away in enumerate(distances):
         rivals = np.flatnonzero(np.isfinite(away))
-        strongest = (similarity[:, count + rivals] + margin * away[rivals].astype(np.float32)).max(axis=1)
+        strongest = (similarity[:, count + rivals] + margin * away[rivals].astype(np.float32)).max(
+            axis=1
+        )
         scores.append(np.where(known, relevance(similarity[:, i], strongest), np.float32(0)))
     return similarity[:, :count], np.stack(scores, axis=1)
 
@@ -73,17 +97,33 @@ class Segmentation:
     """The best of a list of names everywhere."""
 
     names: tuple[str, ...]
-    labels: NDArray[np.int32]        # (N,) row of names, UNLABELLED where the map knows nothing
+    labels: NDArray[np.int32]  # (N,) row of names, UNLABELLED where the map knows nothing
     confidence: NDArray[np.float32]  # (N,) 0..1, softmax of the best
 
 
-def segment(features: LatentMap, points: NDArray, encoder: TextEncoder, names: Sequence[str], *,
-            templates: Sequence[str] = TEMPLATES) -> Segmentation:
-    """The best name at points (N, 3) world [m]; raises InputError for fewer than two names, or as `ask`."""
+def segment(
+    features: LatentMap,
+    points: NDArray,
+    encoder: TextEncoder,
+    names: Sequence[str],
+    *,
+    templates: Sequence[str] = TEMPLATES,
+) -> Segmentation:
+    """The best name at points (N, 3) world [m]; raises InputError for fewer than two names, or as
+    `ask`.
+    """
     if len(names) < 2 or len(set(names)) < len(names):
-        raise InputError(f"segment: needs at least two names, each once, got {', '.join(names) or 'none'}")
-    similarity, known = features.similarity(points, embed(encoder, names, templates), return_valid=True)
+        raise InputError(
+            f"segment: needs at least two names, each once, got {', '.join(names) or 'none'}"
+        )
+    similarity, known = features.similarity(
+        points, embed(encoder, names, templates), return_valid=True
+    )
     labels = similarity.argmax(axis=1).astype(np.int32)
     best = np.take_along_axis(similarity, labels[:, None].astype(np.int64), axis=1)
     confidence = 1 / np.exp(LOGIT_SCALE * (similarity - best)).sum(axis=1)
-    return Segmentation(tuple(names), np.where(known, labels, UNLABELLED), np.where(known, confidence, 0).astype(np.float32))
+    return Segmentation(
+        tuple(names),
+        np.where(known, labels, UNLABELLED),
+        np.where(known, confidence, 0).astype(np.float32),
+    )

@@ -10,23 +10,26 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..types import Mesh
 
-THRESHOLD = 0.5   # relevance above which a vertex belongs to a region: it beats all rivals
-MIN_AREA = 0.01   # [m^2] of a region; smaller ones are stray
+THRESHOLD = 0.5  # relevance above which a vertex belongs to a region: it beats all rivals
+MIN_AREA = 0.01  # [m^2] of a region; smaller ones are stray
 
 
 @dataclass(frozen=True)
 class Region:
     """A connected part of the surface that answers a query."""
 
-    score: float                    # relevance, mean over its area
-    area: float                     # [m^2]
-    centroid: NDArray[np.float64]   # (3,) world [m], of its area
-    box: NDArray[np.float64]        # (2, 3) world [m]: lowest and highest corner
-    vertices: NDArray[np.int64]     # of the mesh
+    score: float  # relevance, mean over its area
+    area: float  # [m^2]
+    centroid: NDArray[np.float64]  # (3,) world [m], of its area
+    box: NDArray[np.float64]  # (2, 3) world [m]: lowest and highest corner
+    vertices: NDArray[np.int64]  # of the mesh
 
 
-def find_regions(mesh: Mesh, relevance: NDArray, *, threshold: float = THRESHOLD, min_area: float = MIN_AREA) -> list[Region]:
-    """Connected parts of a mesh where `relevance` (V,) reaches the threshold, by how much of it they hold beyond that.
+def find_regions(
+    mesh: Mesh, relevance: NDArray, *, threshold: float = THRESHOLD, min_area: float = MIN_AREA
+) -> list[Region]:
+    """Connected parts of a mesh where `relevance` (V,) reaches the threshold, by how much of it
+    they hold beyond that.
 
     Raises InputError for a relevance of another mesh or a threshold outside 0..1.
     """
@@ -37,7 +40,9 @@ def find_regions(mesh: Mesh, relevance: NDArray, *, threshold: float = THRESHOLD
     if relevance.shape != (count,):
         raise InputError(f"regions: relevance must be ({count},), got {relevance.shape}")
     if not 0 < threshold < 1 or min_area < 0:
-        raise InputError(f"regions: need 0 < threshold < 1 and min_area >= 0, got {threshold} and {min_area}")
+        raise InputError(
+            f"regions: need 0 < threshold < 1 and min_area >= 0, got {threshold} and {min_area}"
+        )
     inside = relevance >= threshold
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     edges = edges[inside[edges].all(axis=1)]
@@ -47,18 +52,30 @@ def find_regions(mesh: Mesh, relevance: NDArray, *, threshold: float = THRESHOLD
     vertices = np.flatnonzero(inside)
     order = vertices[np.argsort(part[vertices], kind="stable")]
     groups = np.split(order, np.flatnonzero(np.diff(part[order])) + 1) if len(order) else []
-    regions = [_region(mesh, relevance, areas, group) for group in groups if areas[group].sum() >= max(min_area, 1e-12)]
+    regions = [
+        _region(mesh, relevance, areas, group)
+        for group in groups
+        if areas[group].sum() >= max(min_area, 1e-12)
+    ]
     return sorted(regions, key=lambda region: -(region.score - threshold) * region.area)
 
 
 def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
     """Area (V,) [m^2] that each vertex stands for: a third of its triangles'."""
     corner = mesh.vertices[mesh.faces].astype(np.float64)
-    areas = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 6
+    areas = (
+        np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+        / 6
+    )
     return np.bincount(mesh.faces.ravel(), np.repeat(areas, 3), len(mesh.vertices))
 
 
 def _region(mesh: Mesh, relevance: NDArray, areas: NDArray, group: NDArray) -> Region:
     points, share = mesh.vertices[group].astype(np.float64), areas[group] / areas[group].sum()
-    return Region(float(share @ relevance[group]), float(areas[group].sum()), share @ points,
-                  np.stack([points.min(axis=0), points.max(axis=0)]), group)
+    return Region(
+        float(share @ relevance[group]),
+        float(areas[group].sum()),
+        share @ points,
+        np.stack([points.min(axis=0), points.max(axis=0)]),
+        group,
+    )

@@ -1,4 +1,6 @@
-"""Latent Implicit Maps (Fig. 5). Names load when they are used: the settings need no Taichi, the maps do."""
+"""Latent Implicit Maps (Fig. 5). Names load when they are used: the settings need no Taichi, the
+maps do.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,25 @@ if TYPE_CHECKING:
     from .settings import LatentSettings, MapSettings, PropertySettings, SurfaceSettings
     from .surface_map import SurfaceMap
 
-__all__ = ["BaseMap", "Integration", "LatentMap", "LatentSettings", "MapSettings", "PropertyGroup", "PropertyMap",
-           "PropertySettings", "SurfaceMap", "SurfaceSettings", "load_map"]
+__all__ = [
+    "BaseMap",
+    "Integration",
+    "LatentMap",
+    "LatentSettings",
+    "MapSettings",
+    "PropertyGroup",
+    "PropertyMap",
+    "PropertySettings",
+    "SurfaceMap",
+    "SurfaceSettings",
+    "load_map",
+]
 
 
 def load_map(path: str | Path) -> BaseMap:
     """The map in a file, of whatever kind it is; raises MapCorrupt or FileError."""
-    for module in ("property_map", "latent_map", "surface_map"):  # a kind of map registers itself when its module loads
+    # a kind of map registers itself when its module loads
+    for module in ("property_map", "latent_map", "surface_map"):
         import_module(f".{module}", __name__)
     return __getattr__("BaseMap").load(path)
 

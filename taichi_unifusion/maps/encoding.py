@@ -1,4 +1,5 @@
-"""Position encoding f_posi: the Matern-7/2 kernel on the unit cube as an l-dimensional feature (Sec. III-B).
+"""Position encoding f_posi: the Matern-7/2 kernel on the unit cube as an l-dimensional feature
+(Sec. III-B).
 
 Computed once, in float64 NumPy, from a fixed seed. Encoder coordinates `t` lie in [-0.5, 0.5]^3.
 """
@@ -29,7 +30,9 @@ class EncoderSettings:
 
     def __post_init__(self) -> None:
         if not 1 <= self.rank <= self.anchors:
-            raise InputError(f"encoder: rank must lie in 1..anchors, got rank {self.rank} and {self.anchors} anchors")
+            raise InputError(
+                f"encoder: rank must lie in 1..anchors, got rank {self.rank} and {self.anchors} anchors"
+            )
         if self.length_scale <= 0:
             raise InputError(f"encoder: length_scale must be positive, got {self.length_scale}")
 
@@ -55,16 +58,22 @@ class PositionEncoding:
     @cached_property
     def anchors(self) -> NDArray[np.float64]:
         """(A, 3) uniform samples of the cube."""
-        return np.random.default_rng(self.settings.seed).uniform(-0.5, 0.5, (self.settings.anchors, 3))
+        return np.random.default_rng(self.settings.seed).uniform(
+            -0.5, 0.5, (self.settings.anchors, 3)
+        )
 
     @cached_property
     def projection(self) -> NDArray[np.float64]:
         """(A, l): U Lambda^-1/2 of the anchors' kernel matrix, largest eigenvalues first."""
         distance = np.linalg.norm(self.anchors[:, None] - self.anchors[None], axis=2)
         values, vectors = np.linalg.eigh(matern72(distance, self.settings.length_scale))
-        values, vectors = values[::-1][:self.settings.rank], vectors[:, ::-1][:, :self.settings.rank]
+        values, vectors = (
+            values[::-1][: self.settings.rank],
+            vectors[:, ::-1][:, : self.settings.rank],
+        )
         largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(self.settings.rank)]
-        return vectors * np.sign(largest) / np.sqrt(values)  # eigenvectors of the same sign on every machine
+        # eigenvectors of the same sign on every machine
+        return vectors * np.sign(largest) / np.sqrt(values)
 
     def __call__(self, t: NDArray) -> NDArray[np.float64]:
         """f_posi: (N, 3) encoder coordinates -> (N, l)."""
@@ -74,7 +83,9 @@ class PositionEncoding:
     def gradient(self, t: NDArray) -> NDArray[np.float64]:
         """d f_posi / d t_i of Eq. 14: (N, 3) -> (N, 3, l)."""
         offset = np.asarray(t, np.float64)[:, None] - self.anchors[None]
-        slope = _matern72_slope_over_distance(np.linalg.norm(offset, axis=2), self.settings.length_scale)
+        slope = _matern72_slope_over_distance(
+            np.linalg.norm(offset, axis=2), self.settings.length_scale
+        )
         return np.einsum("na,nad,al->ndl", slope, offset, self.projection)
 
     def nodes(self, count: int) -> NDArray[np.float64]:

@@ -1,4 +1,6 @@
-"""Storage of high-dimensional features: a mean and q slopes of c numbers for every voxel, in one of several precisions."""
+"""Storage of high-dimensional features: a mean and q slopes of c numbers for every voxel, in one of
+several precisions.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,8 @@ _TAICHI = {"float16": ti.f16, "float32": ti.f32, "int8": ti.i8}
 class RowData:
     """Features of voxels by value."""
 
-    means: NDArray              # (N, c)
-    slopes: NDArray             # (N, q c), times the scale of their row
+    means: NDArray  # (N, c)
+    slopes: NDArray  # (N, q c), times the scale of their row
     scales: NDArray[np.float32]  # (N, q); 1 where slopes are floating-point numbers
 
 
@@ -55,12 +57,16 @@ class FeatureRows:
         return self.channels * (mean + self.slope_rows * slope) + 4 * self.slope_rows
 
     def reserve(self, capacity: int, used: int) -> None:
-        """Room for `capacity` voxels, the first `used` of which are kept; raises CapacityError beyond Taichi's arrays."""
+        """Room for `capacity` voxels, the first `used` of which are kept; raises CapacityError
+        beyond Taichi's arrays.
+        """
         if self.means.shape[0] == capacity:
             return
         if capacity * self.slope_rows * self.channels > MAX_ELEMENTS:
-            raise CapacityError(f"the map holds {used:,} voxels of {self.slope_rows} x {self.channels} numbers, as many as fit "
-                                "into an array: use larger voxels or save the map and start a new one")
+            raise CapacityError(
+                f"the map holds {used:,} voxels of {self.slope_rows} x {self.channels} numbers, as many as fit "
+                "into an array: use larger voxels or save the map and start a new one"
+            )
         old, kept = self.pools, min(self.means.shape[0], used)
         self._allocate(capacity)
         if kept:
@@ -70,9 +76,11 @@ class FeatureRows:
     def export(self, slots: NDArray[np.int32]) -> RowData:
         """Features of the voxels in `slots`, in order."""
         mean, slope = self.dtypes
-        data = RowData(np.empty((len(slots), self.channels), mean),
-                       np.empty((len(slots), self.slope_rows * self.channels), slope),
-                       np.empty((len(slots), self.slope_rows), np.float32))
+        data = RowData(
+            np.empty((len(slots), self.channels), mean),
+            np.empty((len(slots), self.slope_rows * self.channels), slope),
+            np.empty((len(slots), self.slope_rows), np.float32),
+        )
         if len(slots):
             for source, target in zip(self.pools, vars(data).values(), strict=True):
                 gather_rows(slots, source, target)
@@ -86,10 +94,19 @@ class FeatureRows:
 
     def check(self, path: object, count: int, data: RowData) -> None:
         """MapCorrupt where a file's features are not those of `count` voxels of this storage."""
-        wanted = {"means": ((count, self.channels), self.dtypes[0]),
-                  "slopes": ((count, self.slope_rows * self.channels), self.dtypes[1]),
-                  "scales": ((count, self.slope_rows), np.dtype(np.float32))}
+        wanted = {
+            "means": ((count, self.channels), self.dtypes[0]),
+            "slopes": ((count, self.slope_rows * self.channels), self.dtypes[1]),
+            "scales": ((count, self.slope_rows), np.dtype(np.float32)),
+        }
         for name, (shape, dtype) in wanted.items():
             array = getattr(data, name)
-            if array is None or array.shape != shape or array.dtype != dtype or not np.isfinite(array).all():
-                raise MapCorrupt(f"{path}: tensor '{name}' should be {shape} finite {dtype}; integrate the frames again")
+            if (
+                array is None
+                or array.shape != shape
+                or array.dtype != dtype
+                or not np.isfinite(array).all()
+            ):
+                raise MapCorrupt(
+                    f"{path}: tensor '{name}' should be {shape} finite {dtype}; integrate the frames again"
+                )

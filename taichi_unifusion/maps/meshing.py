@@ -1,7 +1,9 @@
-"""Surface LIM -> welded mesh: the signed distance on a grid around every supported voxel, then marching cubes (Sec. IV-B).
+"""Surface LIM -> welded mesh: the signed distance on a grid around every supported voxel, then
+marching cubes (Sec. IV-B).
 
-The grid comes in cubes that span the centres of eight neighbouring voxels: within one, the same eight doubled voxels blend,
-so that a cube of samples is one matrix product with their concatenated latents.
+The grid comes in cubes that span the centres of eight neighbouring voxels: within one, the same
+eight doubled voxels blend, so that a cube of samples is one matrix product with their concatenated
+latents.
 """
 
 from __future__ import annotations
@@ -14,37 +16,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from .encoding import PositionEncoding
 from ..kernels import marching_cubes as kernels
 from ..kernels import query
 from ..kernels.visibility import interpolate_evidence
 from ..types import Mesh
+from .encoding import PositionEncoding
 
 if TYPE_CHECKING:
     from .voxel_grid import VoxelGrid
 
 STEPS = np.array(list(product((0, 1), repeat=3)))  # (8, 3) corners of a cube, x slowest
-SNAP = 1e-4                                        # of an edge: a cut this near to a vertex goes through it
-NORMAL_UNIT = float(1 << 18)                       # fixed-point one of summed normals, in squared grid spacings
+SNAP = 1e-4  # of an edge: a cut this near to a vertex goes through it
+NORMAL_UNIT = float(1 << 18)  # fixed-point one of summed normals, in squared grid spacings
 
 
-def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float, resolution: int, support_closing: int,
-                 min_evidence: float) -> Mesh:
-    """Zero level of the blended field on `resolution`^3 cells a voxel, only where cells are supported.
+def extract_mesh(
+    grid: VoxelGrid,
+    encoding: PositionEncoding,
+    voxel_size: float,
+    resolution: int,
+    support_closing: int,
+    min_evidence: float,
+) -> Mesh:
+    """Zero level of the blended field on `resolution`^3 cells a voxel, only where cells are
+    supported.
 
-    A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map holds evidence, the mesh
-    ends on the line where evidence falls below `min_evidence`.
+    A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map
+    holds evidence, the mesh ends on the line where evidence falls below `min_evidence`.
     """
     keys, support = _cubes(grid, support_closing)
     if not len(keys):
-        return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+        return Mesh(
+            np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32)
+        )
     upper = _upper_cubes(keys)
     sdf = np.empty((len(keys), resolution**3), np.float32)
-    query.sdf_grid(encoding.settings.rank, keys, grid.slot, grid.latents, *grid_basis(encoding, resolution), sdf)
+    query.sdf_grid(
+        encoding.settings.rank,
+        keys,
+        grid.slot,
+        grid.latents,
+        *grid_basis(encoding, resolution),
+        sdf,
+    )
     vertices, faces = _march(keys, upper, support, sdf, resolution, voxel_size)
     if grid.with_evidence and len(faces):
         evidence = np.empty(len(vertices), np.float32)
-        interpolate_evidence(vertices, 1.0 / voxel_size, grid.slot, grid.masks, grid.evidence, evidence)
+        interpolate_evidence(
+            vertices, 1.0 / voxel_size, grid.slot, grid.masks, grid.evidence, evidence
+        )
         vertices, faces = cut_mesh(vertices, faces, evidence - np.float32(min_evidence))
     sums = np.zeros((len(vertices), 3), np.int32)
     if len(faces):
@@ -53,43 +73,66 @@ def extract_mesh(grid: VoxelGrid, encoding: PositionEncoding, voxel_size: float,
     return Mesh(vertices, faces, normals.astype(np.float32))
 
 
-def cut_mesh(vertices: NDArray[np.float32], faces: NDArray[np.int32], values: NDArray[np.float32]
-             ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """The part of a mesh where `values` (V,), linear on every triangle, are not negative; triangles on the border are cut."""
+def cut_mesh(
+    vertices: NDArray[np.float32], faces: NDArray[np.int32], values: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """The part of a mesh where `values` (V,), linear on every triangle, are not negative; triangles
+    on the border are cut.
+    """
     inside = values >= 0
     corners = inside[faces].sum(axis=1)
     if (corners == 3).all():
         return vertices, faces
-    odd_in = _odd_first(faces[corners == 1], inside)     # a corner stays: the first
-    odd_out = _odd_first(faces[corners == 2], ~inside)   # a corner goes: the first
-    edges = np.concatenate([odd_in[:, [0, 1]], odd_in[:, [0, 2]], odd_out[:, [0, 1]], odd_out[:, [0, 2]]])
+    odd_in = _odd_first(faces[corners == 1], inside)  # a corner stays: the first
+    odd_out = _odd_first(faces[corners == 2], ~inside)  # a corner goes: the first
+    edges = np.concatenate(
+        [odd_in[:, [0, 1]], odd_in[:, [0, 2]], odd_out[:, [0, 1]], odd_out[:, [0, 2]]]
+    )
     low, high = np.sort(edges, axis=1).astype(np.int64).T
-    cut, at = np.unique(low * len(vertices) + high, return_inverse=True)   # an edge is cut once, also between two triangles
+    # an edge is cut once, also between two triangles
+    cut, at = np.unique(low * len(vertices) + high, return_inverse=True)
     a, b = cut // len(vertices), cut % len(vertices)
     share = values[a] / (values[a] - values[b])
     on_edges = vertices[a] + share[:, None] * (vertices[b] - vertices[a])
-    number = np.where(share < SNAP, a, np.where(share > 1 - SNAP, b, len(vertices) + np.arange(len(cut))))
-    i, j, p, q = np.split(number[at.reshape(-1)], np.cumsum([len(odd_in), len(odd_in), len(odd_out)]))
-    rest = np.concatenate([faces[corners == 3], np.stack([odd_in[:, 0], i, j], axis=1),
-                           np.stack([p, odd_out[:, 1], odd_out[:, 2]], axis=1), np.stack([p, odd_out[:, 2], q], axis=1)])
-    rest = rest[(rest != np.roll(rest, 1, axis=1)).all(axis=1)]   # what a cut through a corner makes of a triangle
+    number = np.where(
+        share < SNAP, a, np.where(share > 1 - SNAP, b, len(vertices) + np.arange(len(cut)))
+    )
+    i, j, p, q = np.split(
+        number[at.reshape(-1)], np.cumsum([len(odd_in), len(odd_in), len(odd_out)])
+    )
+    rest = np.concatenate(
+        [
+            faces[corners == 3],
+            np.stack([odd_in[:, 0], i, j], axis=1),
+            np.stack([p, odd_out[:, 1], odd_out[:, 2]], axis=1),
+            np.stack([p, odd_out[:, 2], q], axis=1),
+        ]
+    )
+    # what a cut through a corner makes of a triangle
+    rest = rest[(rest != np.roll(rest, 1, axis=1)).all(axis=1)]
     return _without_unused(np.concatenate([vertices, on_edges]), rest)
 
 
 def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Faces turned, without changing their orientation, so that their one corner that is `odd` comes first."""
+    """Faces turned, without changing their orientation, so that their one corner that is `odd`
+    comes first.
+    """
     first = np.argmax(odd[faces], axis=1)[:, None]
     return np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
 
 
-def _without_unused(vertices: NDArray[np.float32], faces: NDArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _without_unused(
+    vertices: NDArray[np.float32], faces: NDArray
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     return vertices[used], (np.cumsum(used) - 1).astype(np.int32)[faces]
 
 
 def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
-    """The mesh without connected parts of less than `min_area` square metres: mostly stray readings."""
+    """The mesh without connected parts of less than `min_area` square metres: mostly stray
+    readings.
+    """
     if min_area <= 0 or not len(mesh.faces):
         return mesh
     part, changed = np.arange(len(mesh.vertices), dtype=np.int32), np.ones(1, np.int32)
@@ -99,22 +142,34 @@ def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
         runtime.synchronize()
     a = mesh.faces[:, 0]
     corners = mesh.vertices[mesh.faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    kept = np.bincount(part[a], areas)[part] >= min_area                    # (V,)
+    areas = (
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        / 2
+    )
+    kept = np.bincount(part[a], areas)[part] >= min_area  # (V,)
     renumber = (np.cumsum(kept) - 1).astype(np.int32)
-    return Mesh(mesh.vertices[kept], renumber[mesh.faces[kept[a]]], None if mesh.normals is None else mesh.normals[kept],
-                {name: values[kept] for name, values in mesh.attributes.items()})
+    return Mesh(
+        mesh.vertices[kept],
+        renumber[mesh.faces[kept[a]]],
+        None if mesh.normals is None else mesh.normals[kept],
+        {name: values[kept] for name, values in mesh.attributes.items()},
+    )
 
 
 def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
-    """Sorted keys (Q, 3) of the cubes that hold surface or close one that does, and their support masks (Q, 2)."""
+    """Sorted keys (Q, 3) of the cubes that hold surface or close one that does, and their support
+    masks (Q, 2).
+    """
     keys = unique_rows((grid.voxel_keys()[:, None] + STEPS).reshape(-1, 3))
     support = np.empty((len(keys), 2), np.uint32)
     if len(keys):
         query.corner_support(keys, grid.slot, grid.masks, support_closing, support)
     with_surface = support.any(axis=1)
     keys, support = keys[with_surface], support[with_surface]
-    closed = unique_rows((keys[:, None] + STEPS).reshape(-1, 3))  # the last cells of a cube need the samples above
+    # the last cells of a cube need the samples above
+    closed = unique_rows((keys[:, None] + STEPS).reshape(-1, 3))
     closed_support = np.zeros((len(closed), 2), np.uint32)
     closed_support[np.searchsorted(_codes(closed), _codes(keys))] = support
     return closed, closed_support
@@ -123,7 +178,9 @@ def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int32], ND
 def unique_rows(rows: NDArray) -> NDArray[np.int32]:
     """Distinct integer triples in lexicographic order."""
     codes = np.unique(_codes(rows))
-    return np.stack([(codes >> s & 0x1FFFFF) - (1 << 20) for s in (42, 21, 0)], axis=1).astype(np.int32)
+    return np.stack([(codes >> s & 0x1FFFFF) - (1 << 20) for s in (42, 21, 0)], axis=1).astype(
+        np.int32
+    )
 
 
 def _codes(rows: NDArray) -> NDArray[np.int64]:
@@ -133,7 +190,9 @@ def _codes(rows: NDArray) -> NDArray[np.int64]:
 
 
 def _upper_cubes(keys: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(Q, 8) row of the cube at each of STEPS from every cube, -1 where there is none; `keys` are sorted."""
+    """(Q, 8) row of the cube at each of STEPS from every cube, -1 where there is none; `keys` are
+    sorted.
+    """
     codes = _codes(keys)
     upper = np.empty((len(keys), 8), np.int32)
     for o, step in enumerate(STEPS):
@@ -144,30 +203,59 @@ def _upper_cubes(keys: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 @lru_cache(maxsize=8)
-def grid_basis(encoding: PositionEncoding, resolution: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Tent weight times f_posi (R^3, 8 l), and tent weight (R^3, 8), of the eight voxels at the samples of a cube."""
-    samples = np.stack(np.meshgrid(*[np.arange(resolution) / resolution] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+def grid_basis(
+    encoding: PositionEncoding, resolution: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Tent weight times f_posi (R^3, 8 l), and tent weight (R^3, 8), of the eight voxels at the
+    samples of a cube.
+    """
+    samples = np.stack(
+        np.meshgrid(*[np.arange(resolution) / resolution] * 3, indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     basis, tents = [], []
     for step in STEPS:
-        t = (samples - step) / 2  # from the centre of voxel key - 1 + step, which is corner `step` of the cube
+        # from the centre of voxel key - 1 + step, which is corner `step` of the cube
+        t = (samples - step) / 2
         tents.append(np.prod(1 - 2 * np.abs(t), axis=1))
         basis.append(tents[-1][:, None] * encoding(t))
-    return np.ascontiguousarray(np.hstack(basis), np.float32), np.ascontiguousarray(np.stack(tents, axis=1), np.float32)
+    return np.ascontiguousarray(np.hstack(basis), np.float32), np.ascontiguousarray(
+        np.stack(tents, axis=1), np.float32
+    )
 
 
-def _march(keys, upper, support, sdf, resolution, voxel_size) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _march(
+    keys, upper, support, sdf, resolution, voxel_size
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Vertices (V, 3) world [m] and faces (F, 3) of the zero level."""
     counts, flags, table, edge_table = marching_cubes_tables()
     cases, edges = np.empty(sdf.shape, np.uint8), np.zeros(sdf.shape, np.int32)
     triangles, on_edges = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
-    kernels.classify_cells(resolution, upper, support, sdf, counts, edge_table, flags, cases, edges, triangles)
+    kernels.classify_cells(
+        resolution, upper, support, sdf, counts, edge_table, flags, cases, edges, triangles
+    )
     kernels.count_vertices(edges, on_edges)
     vertex_starts, triangle_starts = _starts(on_edges), _starts(triangles)
-    vertices, faces = np.empty((on_edges.sum(), 3), np.float32), np.empty((triangles.sum(), 3), np.int32)
+    vertices, faces = (
+        np.empty((on_edges.sum(), 3), np.float32),
+        np.empty((triangles.sum(), 3), np.int32),
+    )
     if len(faces):
         first = np.empty(sdf.shape, np.int32)
-        kernels.place_vertices(resolution, keys, upper, sdf, edges, vertex_starts, voxel_size, first, vertices)
-        kernels.emit_triangles(resolution, upper, cases, edges, first, triangle_starts, counts, table, edge_table, faces)
+        kernels.place_vertices(
+            resolution, keys, upper, sdf, edges, vertex_starts, voxel_size, first, vertices
+        )
+        kernels.emit_triangles(
+            resolution,
+            upper,
+            cases,
+            edges,
+            first,
+            triangle_starts,
+            counts,
+            table,
+            edge_table,
+            faces,
+        )
     return vertices, faces
 
 
@@ -177,24 +265,35 @@ def _starts(counts: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @lru_cache(maxsize=1)
 def marching_cubes_tables() -> tuple[NDArray[np.int32], ...]:
-    """Triangles of the 256 cases: counts (256,), edge flags (256,), edges (256, 15), and the edges' corner and axis (12, 4).
+    """Triangles of the 256 cases: counts (256,), edge flags (256,), edges (256, 15), and the edges'
+    corner and axis (12, 4).
 
-    Built, not copied: on every face of the cell, segments keep the corners behind the surface together on their own side
-    (also on ambiguous faces, so that neighbours agree); the segments close to loops, and each loop becomes a fan. Triangles
-    are counter-clockwise seen from in front of the surface.
+    Built, not copied: on every face of the cell, segments keep the corners behind the surface
+    together on their own side (also on ambiguous faces, so that neighbours agree); the segments
+    close to loops, and each loop becomes a fan. Triangles are counter-clockwise seen from in front
+    of the surface.
     """
-    edges = [(o, d) for d in range(3) for o in range(8) if not STEPS[o][d]]     # lower corner, axis
+    edges = [(o, d) for d in range(3) for o in range(8) if not STEPS[o][d]]  # lower corner, axis
     edge_of = {frozenset((o, o + (4 >> d))): e for e, (o, d) in enumerate(edges)}
-    counts, flags, table = np.zeros(256, np.int32), np.zeros(256, np.int32), np.zeros((256, 15), np.int32)
+    counts, flags, table = (
+        np.zeros(256, np.int32),
+        np.zeros(256, np.int32),
+        np.zeros((256, 15), np.int32),
+    )
     for case in range(256):
         follow = {}
         for corners in _faces():
             behind = [case >> o & 1 for o in corners]
-            for k in range(4):  # a segment enters where the walk goes behind the surface and leaves where it comes out next
+            # a segment enters where the walk goes behind the surface and leaves where it comes out
+            # next
+            for k in range(4):
                 if not behind[k] and behind[(k + 1) % 4]:
-                    out = next(j for j in range(k + 1, k + 5) if behind[j % 4] and not behind[(j + 1) % 4])
+                    out = next(
+                        j for j in range(k + 1, k + 5) if behind[j % 4] and not behind[(j + 1) % 4]
+                    )
                     follow[edge_of[frozenset((corners[k], corners[(k + 1) % 4]))]] = edge_of[
-                        frozenset((corners[out % 4], corners[(out + 1) % 4]))]
+                        frozenset((corners[out % 4], corners[(out + 1) % 4]))
+                    ]
         triangles = []
         while follow:
             loop = [next(iter(follow))]
@@ -204,7 +303,7 @@ def marching_cubes_tables() -> tuple[NDArray[np.int32], ...]:
         counts[case] = len(triangles)
         flat = [e for triangle in triangles for e in triangle]
         flags[case] = sum(1 << e for e in set(flat))
-        table[case, :len(flat)] = flat
+        table[case, : len(flat)] = flat
     return counts, flags, table, np.array([[*STEPS[o], d] for o, d in edges], np.int32)
 
 
@@ -213,6 +312,9 @@ def _faces() -> list[list[int]]:
     faces = []
     for d in range(3):
         u, v = (d + 1) % 3, (d + 2) % 3
-        square = [sum(4 >> a for a, on in ((u, i), (v, j)) if on) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        square = [
+            sum(4 >> a for a, on in ((u, i), (v, j)) if on)
+            for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))
+        ]
         faces += [[o + (4 >> d) for o in square], square[::-1]]
     return faces

@@ -1,12 +1,14 @@
-"""What a map can be told: the settings are checked here, shown by `--help`, and saved with every map."""
+"""What a map can be told: the settings are checked here, shown by `--help`, and saved with every
+map.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-from .encoding import EncoderSettings
 from ..errors import InputError, check_choice
+from .encoding import EncoderSettings
 
 MAX_LATENT_RANK = 20  # of a map of features: its kernels unroll over it
 
@@ -18,23 +20,29 @@ class MapSettings:
     voxel_size: float = 0.05
     """Voxel edge in metres; a latent describes a cube of twice this edge."""
     noise: float = 1.0
-    """Observation noise d of the regression (Eq. 6) relative to the kernel's variance; larger is smoother."""
+    """Observation noise d of the regression (Eq. 6) relative to the kernel's variance; larger is
+    smoother.
+    """
     min_points: int = 4
     """Voxels with fewer samples in a frame are left out of that frame."""
     sampling: Literal["cells", "points"] = "cells"
-    """cells: average a frame's points in 4x4x4 cells a voxel before the regression (fast); points: every point (the paper)."""
+    """cells: average a frame's points in 4x4x4 cells a voxel before the regression (fast); points:
+    every point (the paper).
+    """
     margin: int = 1
-    """Cells (quarters of a voxel) around a voxel that its regression takes in: 2 is the whole doubled voxel, 1 is faster;
-    sampling points always takes the whole."""
+    """Cells (quarters of a voxel) around a voxel that its regression takes in: 2 is the whole
+    doubled voxel, 1 is faster; sampling points always takes the whole."""
     fusion: Literal["mean", "information"] = "mean"
-    """mean: latents of frames are averaged by weight (Eq. 19); information: the regression runs over all frames at once, with
-    several times the memory."""
+    """mean: latents of frames are averaged by weight (Eq. 19); information: the regression runs
+    over all frames at once, with several times the memory."""
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
     """The position encoding."""
 
     def __post_init__(self) -> None:
         if not 1e-4 <= self.voxel_size <= 100:
-            raise InputError(f"voxel_size: must lie between 0.0001 and 100 metres, got {self.voxel_size}")
+            raise InputError(
+                f"voxel_size: must lie between 0.0001 and 100 metres, got {self.voxel_size}"
+            )
         if not 0 < self.noise < float("inf"):
             raise InputError(f"noise: must be positive and finite, got {self.noise}")
         if self.min_points < 1:
@@ -50,29 +58,37 @@ class SurfaceSettings(MapSettings):
     """Settings of the surface map (Sec. IV-B)."""
 
     gpis: Literal["samples", "derivatives"] = "samples"
-    """samples: points on and beside the surface carry signed distances; derivatives: points carry their normals (Eq. 14-17)."""
+    """samples: points on and beside the surface carry signed distances; derivatives: points carry
+    their normals (Eq. 14-17).
+    """
     sample_distance: float = 0.3
     """Distance of the off-surface samples along the normal, in voxels (d_s)."""
     support_points: int = 4
-    """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one frame (fewer where a whole
-    voxel has few); 0: everywhere in voxels that held any."""
+    """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one
+    frame (fewer where a whole voxel has few); 0: everywhere in voxels that held any."""
 
     support_closing: int = 14
-    """Cells with at least this many of their 26 neighbours seen count as seen, which closes pinholes; 27: none, 1: a rim all
-    around."""
+    """Cells with at least this many of their 26 neighbours seen count as seen, which closes
+    pinholes; 27: none, 1: a rim all around."""
     carve: bool = True
     """Cut the mesh where more frames saw through the surface than saw it."""
     min_evidence: float = 0.9
-    """With `carve`: keep surface that at least this many more frames saw than saw through; 1.5 asks for two frames."""
+    """With `carve`: keep surface that at least this many more frames saw than saw through; 1.5 asks
+    for two frames.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 < self.sample_distance <= 1:
-            raise InputError(f"sample_distance: must lie in (0, 1] voxels, got {self.sample_distance}")
+            raise InputError(
+                f"sample_distance: must lie in (0, 1] voxels, got {self.sample_distance}"
+            )
         if self.support_points < 0:
             raise InputError(f"support_points: must not be negative, got {self.support_points}")
         if not 1 <= self.support_closing <= 27:
-            raise InputError(f"support_closing: must lie in 1..27 neighbours, got {self.support_closing}")
+            raise InputError(
+                f"support_closing: must lie in 1..27 neighbours, got {self.support_closing}"
+            )
         if not -127 <= self.min_evidence <= 127:
             raise InputError(f"min_evidence: must lie in -127..127 frames, got {self.min_evidence}")
         check_choice("gpis", self.gpis, ("samples", "derivatives"))
@@ -83,17 +99,25 @@ class PropertySettings(MapSettings):
     """Settings of a property map (Sec. IV-C)."""
 
     voxel_size: float = 0.025
-    """Voxel edge in metres; a latent describes a cube of twice this edge. Smaller is sharper where colour fits depth well."""
+    """Voxel edge in metres; a latent describes a cube of twice this edge. Smaller is sharper where
+    colour fits depth well.
+    """
     noise: float = 0.1
-    """Observation noise d of the regression (Eq. 18) relative to the kernel's variance; larger is smoother."""
+    """Observation noise d of the regression (Eq. 18) relative to the kernel's variance; larger is
+    smoother.
+    """
     min_points: int = 1
     """Voxels with fewer samples in a frame are left out of that frame."""
     encoder: EncoderSettings = field(default_factory=lambda: EncoderSettings(rank=12))
     """The position encoding; 12 eigenpairs render as well as 20 here, and half the work."""
     prior: Literal["mean", "zero"] = "mean"
-    """What the field falls back to where a voxel has no data: the voxel's mean, or zero as published."""
+    """What the field falls back to where a voxel has no data: the voxel's mean, or zero as
+    published.
+    """
     blend: bool = True
-    """Decode from all voxels that contain a point, with tent weights; off: from its own voxel only, as published."""
+    """Decode from all voxels that contain a point, with tent weights; off: from its own voxel only,
+    as published.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,21 +131,35 @@ class LatentSettings(MapSettings):
     voxel_size: float = 0.1
     """Voxel edge in metres; a latent describes a cube of twice this edge."""
     noise: float = 1.0
-    """Observation noise d of the regression (Eq. 6) for one feature pixel, relative to the kernel's variance."""
+    """Observation noise d of the regression (Eq. 6) for one feature pixel, relative to the kernel's
+    variance.
+    """
     fusion: Literal["mean", "information"] = "information"
-    """information: the regression runs over all frames at once; there is no other way here, as it costs no more memory."""
+    """information: the regression runs over all frames at once; there is no other way here, as it
+    costs no more memory.
+    """
     encoder: EncoderSettings = field(default_factory=lambda: EncoderSettings(rank=8))
-    """The position encoding; a voxel keeps so many numbers a channel: their mean, and slopes for eigenpairs from the second."""
+    """The position encoding; a voxel keeps so many numbers a channel: their mean, and slopes for
+    eigenpairs from the second.
+    """
     precision: Literal["int8", "float16", "float32"] = "int8"
-    """What a voxel's numbers are kept in; int8: means in half precision, slopes in 8 bits and a scale for each."""
+    """What a voxel's numbers are kept in; int8: means in half precision, slopes in 8 bits and a
+    scale for each.
+    """
     source: str = ""
-    """What made the features, as in clip:MODEL; written by the pipeline, and merged only with the same."""
+    """What made the features, as in clip:MODEL; written by the pipeline, and merged only with the
+    same.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.sampling != "cells" or self.fusion != "information":
-            raise InputError("a map of features knows sampling 'cells' and fusion 'information' only, got "
-                             f"'{self.sampling}' and '{self.fusion}'")
+            raise InputError(
+                "a map of features knows sampling 'cells' and fusion 'information' only, got "
+                f"'{self.sampling}' and '{self.fusion}'"
+            )
         check_choice("precision", self.precision, ("int8", "float16", "float32"))
         if not 2 <= self.encoder.rank <= MAX_LATENT_RANK:
-            raise InputError(f"encoder: rank must lie in 2..{MAX_LATENT_RANK} in a map of features, got {self.encoder.rank}")
+            raise InputError(
+                f"encoder: rank must lie in 2..{MAX_LATENT_RANK} in a map of features, got {self.encoder.rank}"
+            )

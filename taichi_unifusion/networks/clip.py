@@ -1,7 +1,8 @@
 """CLIP and SigLIP by transformers: dense image features without training, and texts.
 
-`dense` is MaskCLIP's way (Zhou et al. 2022): the last attention passes every patch's own value on instead of mixing patches, so
-that each keeps its place. `crops` embeds overlapping windows at several scales: slower, coarser, with more context.
+`dense` is MaskCLIP's way (Zhou et al. 2022): the last attention passes every patch's own value on
+instead of mixing patches, so that each keeps its place. `crops` embeds overlapping windows at
+several scales: slower, coarser, with more context.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
-from ..types import Frame
 from ..language import unit_length
+from ..types import Frame
 
 NORMALIZATION = {  # model type -> mean and standard deviation of the training images, where the folder does not say
     "clip": ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)),
     "siglip": ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
 }
 METHODS = ("dense", "crops")
-SHORT_SIDE = 336        # pixels of the image that a network sees
+SHORT_SIDE = 336  # pixels of the image that a network sees
 CROP_SHARES = (1.0, 0.5, 0.33)  # edges of the windows, by the image's shorter side
-CROP_GRID = 24          # feature pixels along the shorter side
+CROP_GRID = 24  # feature pixels along the shorter side
 BATCH = 16
 
 
@@ -42,17 +43,27 @@ class ClipModel:
         try:
             config = transformers.AutoConfig.from_pretrained(name, local_files_only=not download)
             if config.model_type not in NORMALIZATION:
-                raise InputError(f"{name}: is a model of type '{config.model_type}', not one of {', '.join(NORMALIZATION)}")
+                raise InputError(
+                    f"{name}: is a model of type '{config.model_type}', not one of {', '.join(NORMALIZATION)}"
+                )
             dtype = self.torch.float16 if half else self.torch.float32
-            model = transformers.AutoModel.from_pretrained(name, local_files_only=not download, dtype=dtype)
-            self.tokenizer = transformers.AutoTokenizer.from_pretrained(name, local_files_only=not download)
+            model = transformers.AutoModel.from_pretrained(
+                name, local_files_only=not download, dtype=dtype
+            )
+            self.tokenizer = transformers.AutoTokenizer.from_pretrained(
+                name, local_files_only=not download
+            )
         except InputError:
             raise
-        except Exception as error:  # OSError, ValueError, and what safetensors and the tokenizers have
+        except (
+            Exception
+        ) as error:  # OSError, ValueError, and what safetensors and the tokenizers have
             line = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
             hint = "; --download fetches a model of that name from the Hugging Face hub"
             hint = "" if Path(name).exists() or download else hint
-            raise FileError(f"{name}: no CLIP or SigLIP model that transformers can load here ({line}){hint}") from None
+            raise FileError(
+                f"{name}: no CLIP or SigLIP model that transformers can load here ({line}){hint}"
+            ) from None
         self.kind, self.model = config.model_type, model.to(self.device).eval()
         self.patch = config.vision_config.patch_size
         self.window = config.vision_config.image_size
@@ -63,15 +74,22 @@ class ClipModel:
         check_choice("device", device, ("auto", "cpu", "cuda"))
         has_cuda = self.torch.cuda.is_available()
         if device == "cuda" and not has_cuda:
-            raise MissingDependency("device: this torch finds no CUDA; use device 'cpu', or install torch for CUDA")
+            raise MissingDependency(
+                "device: this torch finds no CUDA; use device 'cpu', or install torch for CUDA"
+            )
         return "cuda" if has_cuda and device != "cpu" else "cpu"
 
     def text_features(self, texts: Sequence[str]) -> NDArray[np.float32]:
         """(n, c), unit length."""
         found = []
         for first in range(0, len(texts), BATCH):
-            tokens = self.tokenizer(list(texts[first:first + BATCH]), return_tensors="pt", truncation=True,
-                                    padding="max_length", max_length=self.text_length).to(self.device)
+            tokens = self.tokenizer(
+                list(texts[first : first + BATCH]),
+                return_tensors="pt",
+                truncation=True,
+                padding="max_length",
+                max_length=self.text_length,
+            ).to(self.device)
             if self.kind == "siglip":
                 tokens.pop("attention_mask", None)  # it was trained without
             with self.torch.inference_mode():
@@ -81,30 +99,49 @@ class ClipModel:
     def pooled_features(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
         """(n, c) of whole normalised images (n, 3, H, W)."""
         with self.torch.inference_mode():
-            return _pooled(self.model.get_image_features(pixel_values=self._tensor(images))).float().cpu().numpy()
+            return (
+                _pooled(self.model.get_image_features(pixel_values=self._tensor(images)))
+                .float()
+                .cpu()
+                .numpy()
+            )
 
     def dense_features(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
         """(n, h, w, c) of normalised images (n, 3, H, W) whose sides are whole patches."""
         n, _, height, width = images.shape
         with self.torch.inference_mode():
             vision = self.model.vision_model
-            out = vision(pixel_values=self._tensor(images), output_hidden_states=True, interpolate_pos_encoding=True)
-            tokens = (self._values_of_head(vision, out.last_hidden_state) if self.kind == "siglip"
-                      else self._values_of_last_layer(vision, out.hidden_states[-2]))
-        return tokens.float().cpu().numpy().reshape(n, height // self.patch, width // self.patch, -1)
+            out = vision(
+                pixel_values=self._tensor(images),
+                output_hidden_states=True,
+                interpolate_pos_encoding=True,
+            )
+            tokens = (
+                self._values_of_head(vision, out.last_hidden_state)
+                if self.kind == "siglip"
+                else self._values_of_last_layer(vision, out.hidden_states[-2])
+            )
+        return (
+            tokens.float().cpu().numpy().reshape(n, height // self.patch, width // self.patch, -1)
+        )
 
     def _values_of_last_layer(self, vision: Any, hidden: Any) -> Any:
         """CLIP: the last layer with each patch attending to itself alone, then norm and projection."""
         layer = vision.encoder.layers[-1]
-        hidden = hidden + layer.self_attn.out_proj(layer.self_attn.v_proj(layer.layer_norm1(hidden)))
+        hidden = hidden + layer.self_attn.out_proj(
+            layer.self_attn.v_proj(layer.layer_norm1(hidden))
+        )
         hidden = hidden + layer.mlp(layer.layer_norm2(hidden))
-        return self.model.visual_projection(vision.post_layernorm(hidden[:, 1:]))  # without the class token
+        # without the class token
+        return self.model.visual_projection(vision.post_layernorm(hidden[:, 1:]))
 
     def _values_of_head(self, vision: Any, hidden: Any) -> Any:
         """SigLIP: its pooling head, applied to each patch by itself."""
         head = vision.head
         attention, size = head.attention, hidden.shape[-1]
-        values = self.torch.nn.functional.linear(hidden, attention.in_proj_weight[2 * size:], attention.in_proj_bias[2 * size:])
+        values = self.torch.nn.functional.linear(
+            hidden, attention.in_proj_weight[2 * size :], attention.in_proj_bias[2 * size :]
+        )
         hidden = attention.out_proj(values)
         return hidden + head.mlp(head.layernorm(hidden))
 
@@ -114,7 +151,9 @@ class ClipModel:
     def normalized(self, color: NDArray[np.uint8], width: int, height: int) -> NDArray[np.float32]:
         """An image (H, W, 3) as the network takes it, (3, height, width)."""
         smaller = width < color.shape[1]
-        resized = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
+        resized = cv2.resize(
+            color, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
+        )
         scaled = (resized.astype(np.float32) / 255 - np.float32(self.mean)) / np.float32(self.std)
         return np.ascontiguousarray(scaled.transpose(2, 0, 1))
 
@@ -129,9 +168,13 @@ class ClipImageEncoder:
         """(h, w, c), unit length; raises FrameError for a frame without colour."""
         if frame.color is None:
             raise FrameError(f"frame {frame.name or frame.index}: has no colour image for CLIP")
-        features = unit_length(self._dense(frame.color) if self.method == "dense" else self._crops(frame.color))
+        features = unit_length(
+            self._dense(frame.color) if self.method == "dense" else self._crops(frame.color)
+        )
         if not np.isfinite(features).any():
-            raise FrameError(f"frame {frame.name or frame.index}: {self.name} gives no finite feature")
+            raise FrameError(
+                f"frame {frame.name or frame.index}: {self.name} gives no finite feature"
+            )
         return features
 
     def _dense(self, color: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -140,26 +183,48 @@ class ClipImageEncoder:
         return self.model.dense_features(self.model.normalized(color, width, height)[None])[0]
 
     def _crops(self, color: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Mean over the windows that hold a pixel, each counting by how central the pixel lies in it."""
+        """Mean over the windows that hold a pixel, each counting by how central the pixel lies in
+        it.
+        """
         height, width = color.shape[:2]
         h, w = (max(round(CROP_GRID * side / min(height, width)), 1) for side in (height, width))
         windows = [window for share in CROP_SHARES for window in _windows(height, width, share)]
         total, weights = None, np.full((h, w, 1), 1e-6, np.float32)
         rows, columns = (np.arange(h) + 0.5) / h * height, (np.arange(w) + 0.5) / w * width
         for first in range(0, len(windows), BATCH):
-            batch = windows[first:first + BATCH]
-            images = np.stack([self.model.normalized(np.ascontiguousarray(color[y:y + edge, x:x + edge]), self.model.window,
-                                                     self.model.window) for y, x, edge in batch])
-            for (y, x, edge), feature in zip(batch, unit_length(self.model.pooled_features(images)), strict=True):
-                share = np.outer(_tent(rows, y, edge), _tent(columns, x, edge))[..., None].astype(np.float32)
+            batch = windows[first : first + BATCH]
+            images = np.stack(
+                [
+                    self.model.normalized(
+                        np.ascontiguousarray(color[y : y + edge, x : x + edge]),
+                        self.model.window,
+                        self.model.window,
+                    )
+                    for y, x, edge in batch
+                ]
+            )
+            for (y, x, edge), feature in zip(
+                batch, unit_length(self.model.pooled_features(images)), strict=True
+            ):
+                share = np.outer(_tent(rows, y, edge), _tent(columns, x, edge))[..., None].astype(
+                    np.float32
+                )
                 total = share * feature if total is None else total + share * feature
                 weights += share
         return total / weights
 
 
-def clip_image_encoder(name: str, *, method: Literal["dense", "crops"] = "dense", short_side: int = SHORT_SIDE,
-                       device: str = "auto", download: bool = False) -> ClipImageEncoder:
-    """Image encoder of a CLIP or SigLIP model, a folder or a name; InputError, FileError, MissingDependency as they come."""
+def clip_image_encoder(
+    name: str,
+    *,
+    method: Literal["dense", "crops"] = "dense",
+    short_side: int = SHORT_SIDE,
+    device: str = "auto",
+    download: bool = False,
+) -> ClipImageEncoder:
+    """Image encoder of a CLIP or SigLIP model, a folder or a name; InputError, FileError,
+    MissingDependency as they come.
+    """
     check_choice("method", method, METHODS)
     if not 32 <= short_side <= 4096:
         raise InputError(f"short_side: must lie in 32..4096 pixels, got {short_side}")
@@ -177,10 +242,14 @@ def _load(name: str, device: str, download: bool) -> ClipModel:
 
 
 def _windows(height: int, width: int, share: float) -> list[tuple[int, int, int]]:
-    """Squares (top, left, edge) of `share` of the shorter side that cover the image, each half over the next."""
+    """Squares (top, left, edge) of `share` of the shorter side that cover the image, each half over
+    the next.
+    """
     edge = max(round(share * min(height, width)), 1)
-    corners = [np.linspace(0, side - edge, max(-(-2 * (side - edge) // edge), 0) + 1).round().astype(int)
-               for side in (height, width)]
+    corners = [
+        np.linspace(0, side - edge, max(-(-2 * (side - edge) // edge), 0) + 1).round().astype(int)
+        for side in (height, width)
+    ]
     return [(int(y), int(x), edge) for y in corners[0] for x in corners[1]]
 
 
@@ -210,8 +279,9 @@ def _import_torch():
         import torch
         import transformers
     except (ImportError, OSError) as error:
-        raise MissingDependency("CLIP is run by transformers and torch: pip install 'taichi-unifusion[clip]' "
-                                f"({error})") from None
+        raise MissingDependency(
+            f"CLIP is run by transformers and torch: pip install 'taichi-unifusion[clip]' ({error})"
+        ) from None
     transformers.logging.set_verbosity_error()
     transformers.logging.disable_progress_bar()
     return torch, transformers

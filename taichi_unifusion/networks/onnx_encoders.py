@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError, InputError
-from .onnx_session import open_session, run_session
-from ..types import Frame
 from ..language import unit_length
+from ..types import Frame
 from .clip import NORMALIZATION, SHORT_SIDE
+from .onnx_session import open_session, run_session
 from .tokenizer import ClipTokenizer
 
 IMAGE_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
@@ -23,32 +23,59 @@ TEXT_LENGTH = 77  # of CLIP
 
 
 class OnnxImageEncoder:
-    """A network of one RGB image (1, 3, H, W): features (1, h, w, c), (1, c, h, w), or one a patch, (1, [1 +] h w, c)."""
+    """A network of one RGB image (1, 3, H, W): features (1, h, w, c), (1, c, h, w), or one a patch,
+    (1, [1 +] h w, c).
+    """
 
-    def __init__(self, file: str, mean: Sequence[float], std: Sequence[float], size: tuple[int, int] | None, patch: int,
-                 device: str) -> None:
+    def __init__(
+        self,
+        file: str,
+        mean: Sequence[float],
+        std: Sequence[float],
+        size: tuple[int, int] | None,
+        patch: int,
+        device: str,
+    ) -> None:
         self.name, self.mean, self.std, self.patch = f"onnx:{file}", mean, std, patch
         self.session = open_session(file, device)
         inputs = self.session.get_inputs()
-        if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].shape[1] != 3 or inputs[0].type not in IMAGE_TYPES:
+        if (
+            len(inputs) != 1
+            or len(inputs[0].shape) != 4
+            or inputs[0].shape[1] != 3
+            or inputs[0].type not in IMAGE_TYPES
+        ):
             raise InputError(f"{file}: takes {_described(inputs)}, not one image (1, 3, H, W)")
         self.input = inputs[0]
         height, width = (side if isinstance(side, int) else None for side in self.input.shape[2:])
         if size and (width not in (size[0], None) or height not in (size[1], None)):
-            raise InputError(f"{file}: takes images of {width}x{height}, not of {size[0]}x{size[1]}")
+            raise InputError(
+                f"{file}: takes images of {width}x{height}, not of {size[0]}x{size[1]}"
+            )
         self.size = (width, height) if width and height else size
 
     def image_features(self, frame: Frame) -> NDArray[np.float32]:
-        """(h, w, c), unit length; raises FrameError for a frame without colour or where nothing is finite."""
+        """(h, w, c), unit length; raises FrameError for a frame without colour or where nothing is
+        finite.
+        """
         at = f"frame {frame.name or frame.index}"
         if frame.color is None:
             raise FrameError(f"{at}: has no colour image for {self.name}")
         width, height = self.size or self._like(frame.color)
         smaller = width < frame.color.shape[1]
-        image = cv2.resize(frame.color, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
-        image = ((image.astype(np.float32) / 255 - np.float32(self.mean)) / np.float32(self.std)).transpose(2, 0, 1)[None]
-        raw = run_session(self.session, {self.input.name: np.ascontiguousarray(image, IMAGE_TYPES[self.input.type])},
-                          failure=f"{self.name}: fails on an image of {width}x{height}")
+        image = cv2.resize(
+            frame.color,
+            (width, height),
+            interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC,
+        )
+        image = (
+            (image.astype(np.float32) / 255 - np.float32(self.mean)) / np.float32(self.std)
+        ).transpose(2, 0, 1)[None]
+        raw = run_session(
+            self.session,
+            {self.input.name: np.ascontiguousarray(image, IMAGE_TYPES[self.input.type])},
+            failure=f"{self.name}: fails on an image of {width}x{height}",
+        )
         features = unit_length(self._as_image(np.asarray(raw), height, width))
         if not np.isfinite(features).any():
             raise FrameError(f"{at}: {self.name} gives no finite feature")
@@ -57,20 +84,28 @@ class OnnxImageEncoder:
     def _like(self, color: NDArray) -> tuple[int, int]:
         """(width, height) of about the image's shape in whole patches."""
         scale = SHORT_SIDE / min(color.shape[:2])
-        height, width = (max(round(side * scale / self.patch), 1) * self.patch for side in color.shape[:2])
+        height, width = (
+            max(round(side * scale / self.patch), 1) * self.patch for side in color.shape[:2]
+        )
         return width, height
 
     def _as_image(self, raw: NDArray, height: int, width: int) -> NDArray[np.float32]:
         if raw.ndim == 4 and raw.shape[0] == 1:
-            _, first, middle, last = raw.shape  # (h, w, c) or (c, h, w): whichever is of the image's shape
-            channels_last = abs(first * width - middle * height) * last < abs(middle * width - last * height) * first
+            # (h, w, c) or (c, h, w): whichever is of the image's shape
+            _, first, middle, last = raw.shape
+            channels_last = (
+                abs(first * width - middle * height) * last
+                < abs(middle * width - last * height) * first
+            )
             return raw[0] if channels_last else raw[0].transpose(1, 2, 0)
         if raw.ndim == 3 and raw.shape[0] == 1:
             h, w = height // self.patch, width // self.patch
             if raw.shape[1] in (h * w, h * w + 1):
-                return raw[0, -h * w:].reshape(h, w, -1)
-            raise InputError(f"{self.name}: gives {raw.shape[1]} patches for {w}x{h} of {self.patch} pixels; give its patch "
-                             "size")
+                return raw[0, -h * w :].reshape(h, w, -1)
+            raise InputError(
+                f"{self.name}: gives {raw.shape[1]} patches for {w}x{h} of {self.patch} pixels; give its patch "
+                "size"
+            )
         raise InputError(f"{self.name}: its output is {raw.shape}, not an image of features")
 
 
@@ -81,8 +116,12 @@ class OnnxTextEncoder:
         self.name, self.tokenizer = f"onnx:{file}", tokenizer
         self.session = open_session(file, device)
         self.inputs = self.session.get_inputs()
-        if not 1 <= len(self.inputs) <= 2 or any(len(i.shape) != 2 or i.type not in TOKEN_TYPES for i in self.inputs):
-            raise InputError(f"{file}: takes {_described(self.inputs)}, not token numbers (n, 77) and at most their mask")
+        if not 1 <= len(self.inputs) <= 2 or any(
+            len(i.shape) != 2 or i.type not in TOKEN_TYPES for i in self.inputs
+        ):
+            raise InputError(
+                f"{file}: takes {_described(self.inputs)}, not token numbers (n, 77) and at most their mask"
+            )
         length = self.inputs[0].shape[1]
         self.length = length if isinstance(length, int) else TEXT_LENGTH
         self.batch = self.inputs[0].shape[0] if isinstance(self.inputs[0].shape[0], int) else None
@@ -93,32 +132,53 @@ class OnnxTextEncoder:
         step = self.batch or len(texts)
         found = []
         for first in range(0, len(texts), step):
-            part = tokens[first:first + step]
+            part = tokens[first : first + step]
             padded = np.concatenate([part, np.repeat(part[-1:], step - len(part), axis=0)])
-            feeds = {i.name: (padded if k == 0 else padded != 0).astype(TOKEN_TYPES[i.type]) for k, i in enumerate(self.inputs)}
-            raw = run_session(self.session, feeds, failure=f"{self.name}: fails on {len(part)} texts")
-            found.append(np.asarray(raw)[:len(part)])
+            feeds = {
+                i.name: (padded if k == 0 else padded != 0).astype(TOKEN_TYPES[i.type])
+                for k, i in enumerate(self.inputs)
+            }
+            raw = run_session(
+                self.session, feeds, failure=f"{self.name}: fails on {len(part)} texts"
+            )
+            found.append(np.asarray(raw)[: len(part)])
         vectors = np.concatenate(found)
         if vectors.ndim != 2 or not np.isfinite(vectors).all():
-            raise InputError(f"{self.name}: gives {vectors.shape} {'with numbers that are not finite' * (vectors.ndim == 2)}, "
-                             "not one embedding a text")
+            raise InputError(
+                f"{self.name}: gives {vectors.shape} {'with numbers that are not finite' * (vectors.ndim == 2)}, "
+                "not one embedding a text"
+            )
         return unit_length(vectors)
 
 
-def onnx_image_encoder(file: str, *, mean: Sequence[float] = NORMALIZATION["clip"][0],
-                       std: Sequence[float] = NORMALIZATION["clip"][1], size: tuple[int, int] | None = None, patch: int = 16,
-                       device: str = "auto") -> OnnxImageEncoder:
-    """Image encoder in an ONNX file; `size` (width, height) where it leaves that open, `patch` where it gives patches."""
+def onnx_image_encoder(
+    file: str,
+    *,
+    mean: Sequence[float] = NORMALIZATION["clip"][0],
+    std: Sequence[float] = NORMALIZATION["clip"][1],
+    size: tuple[int, int] | None = None,
+    patch: int = 16,
+    device: str = "auto",
+) -> OnnxImageEncoder:
+    """Image encoder in an ONNX file; `size` (width, height) where it leaves that open, `patch`
+    where it gives patches.
+    """
     if len(mean) != 3 or len(std) != 3 or min(std) <= 0 or patch < 1:
-        raise InputError(f"onnx: needs three means, three positive stds and a positive patch, got {mean}, {std}, {patch}")
+        raise InputError(
+            f"onnx: needs three means, three positive stds and a positive patch, got {mean}, {std}, {patch}"
+        )
     return OnnxImageEncoder(file, mean, std, size, patch, device)
 
 
-def onnx_text_encoder(file: str, *, tokenizer: str | Path | None = None, device: str = "auto") -> OnnxTextEncoder:
+def onnx_text_encoder(
+    file: str, *, tokenizer: str | Path | None = None, device: str = "auto"
+) -> OnnxTextEncoder:
     """Text encoder in an ONNX file; `tokenizer` is CLIP's list of merges."""
     if tokenizer is None:
-        raise InputError(f"onnx:{file}: give CLIP's merges with --tokenizer (bpe_simple_vocab_16e6.txt.gz, or a model's "
-                         "merges.txt)")
+        raise InputError(
+            f"onnx:{file}: give CLIP's merges with --tokenizer (bpe_simple_vocab_16e6.txt.gz, or a model's "
+            "merges.txt)"
+        )
     return OnnxTextEncoder(file, ClipTokenizer(tokenizer), device)
 
 

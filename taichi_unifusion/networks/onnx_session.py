@@ -14,10 +14,11 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 def open_session(file: str | Path, device: str = "auto") -> InferenceSession:
-    """The network in a file, on CUDA where onnxruntime has it, else on the CPU, or on the `device` that is named.
+    """The network in a file, on CUDA where onnxruntime has it, else on the CPU, or on the `device`
+    that is named.
 
-    Raises FileError for a file that is missing or no model, InputError for an unknown device, MissingDependency without
-    onnxruntime or its CUDA.
+    Raises FileError for a file that is missing or no model, InputError for an unknown device,
+    MissingDependency without onnxruntime or its CUDA.
     """
     check_choice("device", device, DEVICES)
     if not Path(file).is_file():
@@ -25,21 +26,31 @@ def open_session(file: str | Path, device: str = "auto") -> InferenceSession:
     try:
         import onnxruntime
     except ImportError:
-        raise MissingDependency("ONNX models are run by onnxruntime: pip install 'taichi-unifusion[models]'") from None
+        raise MissingDependency(
+            "ONNX models are run by onnxruntime: pip install 'taichi-unifusion[models]'"
+        ) from None
     has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
     if device == "cuda" and not has_cuda:
-        raise MissingDependency("device: this onnxruntime has no CUDA; pip install onnxruntime-gpu, or choose cpu")
+        raise MissingDependency(
+            "device: this onnxruntime has no CUDA; pip install onnxruntime-gpu, or choose cpu"
+        )
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4  # what goes wrong is said here
-    providers = ["CUDAExecutionProvider"] * (has_cuda and device != "cpu") + ["CPUExecutionProvider"]
+    providers = ["CUDAExecutionProvider"] * (has_cuda and device != "cpu") + [
+        "CPUExecutionProvider"
+    ]
     try:  # by path, so that weights in files beside it are found
         return onnxruntime.InferenceSession(str(file), options, providers=providers)
     except Exception as error:  # onnxruntime has a class of its own for every kind
-        raise FileError(f"{file}: not an ONNX model that onnxruntime can run ({first_line(error)})") from error
+        raise FileError(
+            f"{file}: not an ONNX model that onnxruntime can run ({first_line(error)})"
+        ) from error
 
 
 def run_session(session: InferenceSession, feeds: dict, output: str | None = None, *, failure: str):
-    """The network's output of that name, or its first; raises InputError that begins with `failure` where it fails."""
+    """The network's output of that name, or its first; raises InputError that begins with `failure`
+    where it fails.
+    """
     try:
         return session.run(None if output is None else [output], feeds)[0]
     except Exception as error:

@@ -16,17 +16,28 @@ from ..files.atomic import read_bytes
 
 MERGES = 49152 - 256 - 2  # that CLIP uses of the published list, which is longer
 WORD_END = "</w>"
-PIECES = re.compile(r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[^\W\d_]+|\d|(?:[^\s\w]|_)+", re.IGNORECASE)
+PIECES = re.compile(
+    r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[^\W\d_]+|\d|(?:[^\s\w]|_)+",
+    re.IGNORECASE,
+)
 
 
 class ClipTokenizer:
-    """Texts -> token numbers, with the merges that CLIP was trained with (`bpe_simple_vocab_16e6.txt.gz`, or `merges.txt`)."""
+    """Texts -> token numbers, with the merges that CLIP was trained with
+    (`bpe_simple_vocab_16e6.txt.gz`, or `merges.txt`).
+    """
 
     def __init__(self, file: str | Path) -> None:
         self.file = Path(file)
         pairs = _read_merges(self.file)
-        letters = [letter for _, letter in sorted(_BYTE_LETTERS.items(), key=lambda item: _order(item[0]))]
-        tokens = [*letters, *(letter + WORD_END for letter in letters), *("".join(pair) for pair in pairs)]
+        letters = [
+            letter for _, letter in sorted(_BYTE_LETTERS.items(), key=lambda item: _order(item[0]))
+        ]
+        tokens = [
+            *letters,
+            *(letter + WORD_END for letter in letters),
+            *("".join(pair) for pair in pairs),
+        ]
         self.ranks = {pair: rank for rank, pair in enumerate(pairs)}
         self.numbers = {token: number for number, token in enumerate(tokens)}
         self.start, self.end = len(tokens), len(tokens) + 1
@@ -37,8 +48,10 @@ class ClipTokenizer:
         for row, text in zip(rows, texts, strict=True):
             numbers = [self.start, *self._encode(text), self.end]
             if len(numbers) > length:
-                raise InputError(f"text '{text[:60]}': has {len(numbers)} tokens, the text encoder takes {length}; shorten it")
-            row[:len(numbers)] = numbers
+                raise InputError(
+                    f"text '{text[:60]}': has {len(numbers)} tokens, the text encoder takes {length}; shorten it"
+                )
+            row[: len(numbers)] = numbers
         return rows
 
     def _encode(self, text: str) -> list[int]:
@@ -54,12 +67,15 @@ class ClipTokenizer:
             return self._known[word]
         parts = (*word[:-1], word[-1] + WORD_END)
         while len(parts) > 1:
-            pair = min(zip(parts, parts[1:], strict=False), key=lambda pair: self.ranks.get(pair, len(self.ranks)))
+            pair = min(
+                zip(parts, parts[1:], strict=False),
+                key=lambda pair: self.ranks.get(pair, len(self.ranks)),
+            )
             if pair not in self.ranks:
                 break
             joined, i = [], 0
             while i < len(parts):
-                both = parts[i:i + 2] == pair
+                both = parts[i : i + 2] == pair
                 joined.append("".join(pair) if both else parts[i])
                 i += 2 if both else 1
             parts = tuple(joined)
@@ -77,10 +93,13 @@ def _read_merges(path: Path) -> list[tuple[str, str]]:
         text = (gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data).decode("utf-8")
     except (OSError, EOFError, UnicodeDecodeError):
         raise FileError(f"{path}: not a list of byte-pair merges, or a damaged file") from None
-    lines = [line.split() for line in text.splitlines()[1:MERGES + 1]]  # the first line is a version
+    # the first line is a version
+    lines = [line.split() for line in text.splitlines()[1 : MERGES + 1]]
     pairs = [(line[0], line[1]) for line in lines if len(line) == 2]
     if not pairs or len(pairs) < len(lines) - 1:
-        raise FileError(f"{path}: expected one pair of tokens a line, as in CLIP's bpe_simple_vocab_16e6.txt.gz")
+        raise FileError(
+            f"{path}: expected one pair of tokens a line, as in CLIP's bpe_simple_vocab_16e6.txt.gz"
+        )
     return pairs
 
 
@@ -94,9 +113,14 @@ def _order(byte: int) -> tuple[bool, int]:
 
 
 def _byte_letters() -> dict[int, str]:
-    """A printable letter for every byte: itself where it is printable, else one beyond Latin-1, in order."""
+    """A printable letter for every byte: itself where it is printable, else one beyond Latin-1, in
+    order.
+    """
     others = [byte for byte in range(256) if not _printable(byte)]
-    return {byte: chr(byte) if _printable(byte) else chr(256 + others.index(byte)) for byte in range(256)}
+    return {
+        byte: chr(byte) if _printable(byte) else chr(256 + others.index(byte))
+        for byte in range(256)
+    }
 
 
 _BYTE_LETTERS = _byte_letters()

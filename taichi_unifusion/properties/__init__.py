@@ -1,7 +1,7 @@
 """The paper's f_im (Fig. 6): functions that give an image of a property for every frame, by name.
 
-`make_property("style=sketch,voxel_size=0.05")` gives one of these, with options; your own is a `SurfaceProperty` with a
-function.
+`make_property("style=sketch,voxel_size=0.05")` gives one of these, with options; your own is a
+`SurfaceProperty` with a function.
 """
 
 from __future__ import annotations
@@ -14,11 +14,19 @@ if TYPE_CHECKING:
     from .base import Look, SurfaceProperty
     from .specification import make_property
 
-PROPERTIES: dict[str, dict[str, tuple[str, str]]] = {  # name -> method -> module here, what makes it; the first is the default
+# name -> method -> module here, what makes it; the first is the default
+PROPERTIES: dict[str, dict[str, tuple[str, str]]] = {
     "infrared": {"log": ("infrared", "log_infrared"), "linear": ("infrared", "linear_infrared")},
-    "saliency": {"signature": ("saliency", "signature_saliency"), "onnx": ("saliency", "network_saliency")},
-    "style": {"painting": ("style", "painting_style"), "opencv": ("style", "opencv_style"), "sketch": ("style", "sketch_style"),
-              "onnx": ("style", "network_style")},
+    "saliency": {
+        "signature": ("saliency", "signature_saliency"),
+        "onnx": ("saliency", "network_saliency"),
+    },
+    "style": {
+        "painting": ("style", "painting_style"),
+        "opencv": ("style", "opencv_style"),
+        "sketch": ("style", "sketch_style"),
+        "onnx": ("style", "network_style"),
+    },
     "images": {"folder": ("images", "folder_images")},
     "normal": {"depth": ("geometry", "surface_normal")},
     "curvature": {"depth": ("geometry", "mean_curvature")},

@@ -1,4 +1,6 @@
-"""What a property of the surface is: the paper's f_im, a function of a frame, and how its values are shown (Fig. 6)."""
+"""What a property of the surface is: the paper's f_im, a function of a frame, and how its values
+are shown (Fig. 6).
+"""
 
 from __future__ import annotations
 
@@ -11,19 +13,21 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError, InputError, UniFusionError
 from ..maps.settings import PropertySettings
-from ..types import Frame
 from ..rendering.colormaps import check_colormap
+from ..types import Frame
 
-RESERVED = ("surface", "color", "mesh", "preview", "normals", "features")  # files and attributes of every results folder
+# files and attributes of every results folder
+RESERVED = ("surface", "color", "mesh", "preview", "normals", "features")
 
 
 @dataclass(frozen=True)
 class Look:
     """How values become colours."""
 
-    colormap: str = "viridis"                        # one of COLORMAPS; ignored for three channels, which are RGB
-    range: tuple[float, float] | None = (0.0, 1.0)   # values of its two ends; None: where most values of a mesh lie
-    label: str = ""                                  # what the values are, with their unit, for the legend
+    colormap: str = "viridis"  # one of COLORMAPS; ignored for three channels, which are RGB
+    # values of its two ends; None: where most values of a mesh lie
+    range: tuple[float, float] | None = (0.0, 1.0)
+    label: str = ""  # what the values are, with their unit, for the legend
 
     def __post_init__(self) -> None:
         check_colormap(self.colormap)
@@ -33,12 +37,14 @@ class Look:
 
 @dataclass(frozen=True)
 class SurfaceProperty:
-    """A property that a function makes from every frame; it becomes a map, a mesh and a picture of its name.
+    """A property that a function makes from every frame; it becomes a map, a mesh and a picture of
+    its name.
 
         SurfaceProperty("redness", channels=1, function=redness)
 
-    `function` takes a Frame and returns (H, W) or (H, W, c) numbers as large as the depth image; NaN says that there is no
-    value. It raises FrameError where a frame cannot give the property; that frame then adds to the other maps only.
+    `function` takes a Frame and returns (H, W) or (H, W, c) numbers as large as the depth image;
+    NaN says that there is no value. It raises FrameError where a frame cannot give the property;
+    that frame then adds to the other maps only.
     """
 
     name: str
@@ -49,13 +55,19 @@ class SurfaceProperty:
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name) or self.name in RESERVED:
-            raise InputError(f"property '{self.name}': a name has letters, digits, _ and -, and is none of "
-                             f"{', '.join(RESERVED)}")
+            raise InputError(
+                f"property '{self.name}': a name has letters, digits, _ and -, and is none of "
+                f"{', '.join(RESERVED)}"
+            )
         if self.channels < 1:
-            raise InputError(f"property '{self.name}': channels must be at least 1, got {self.channels}")
+            raise InputError(
+                f"property '{self.name}': channels must be at least 1, got {self.channels}"
+            )
 
     def image(self, frame: Frame) -> NDArray[np.float32]:
-        """The property of a frame, (H, W, c); raises FrameError where the frame has none, InputError for a wrong function."""
+        """The property of a frame, (H, W, c); raises FrameError where the frame has none,
+        InputError for a wrong function.
+        """
         at = f"property '{self.name}', frame {frame.name or frame.index}"
         try:
             values = np.asarray(self.function(frame))
@@ -64,13 +76,17 @@ class SurfaceProperty:
         except UniFusionError:
             raise
         except Exception as error:  # a bug in somebody's function ends the run, and what was mapped until then is kept
-            raise InputError(f"{at}: its function failed with {type(error).__name__}: {error}") from error
+            raise InputError(
+                f"{at}: its function failed with {type(error).__name__}: {error}"
+            ) from error
         height, width = frame.depth.shape
         if values.ndim == 2:
             values = values[..., None]
         if values.shape != (height, width, self.channels) or values.dtype.kind not in "fiub":
-            raise InputError(f"{at}: its function must return numbers of shape ({height}, {width}, {self.channels}), got "
-                             f"{values.shape} {values.dtype}")
+            raise InputError(
+                f"{at}: its function must return numbers of shape ({height}, {width}, {self.channels}), got "
+                f"{values.shape} {values.dtype}"
+            )
         values = values.astype(np.float32, copy=False)
         if not np.isfinite(values.max(initial=-np.inf, where=np.isfinite(values))):
             raise FrameError(f"{at}: all values are NaN or infinite")

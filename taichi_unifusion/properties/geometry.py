@@ -10,7 +10,8 @@ from ..preprocessing import PreprocessSettings, normal_image
 from ..types import Frame
 from .base import Look, SurfaceProperty
 
-FARTHEST_JUMP = 0.03  # relative depth step between pixels beyond which they lie on different surfaces
+# relative depth step between pixels beyond which they lie on different surfaces
+FARTHEST_JUMP = 0.03
 
 
 def surface_normal() -> SurfaceProperty:
@@ -22,11 +23,15 @@ def surface_normal() -> SurfaceProperty:
         normals = _normals_of(frame)
         return normals @ frame.T_world_camera[:3, :3].T.astype(np.float32)
 
-    return SurfaceProperty("normal", 3, function, Look(range=(-1.0, 1.0), label="normal x, y, z as red, green, blue"))
+    return SurfaceProperty(
+        "normal", 3, function, Look(range=(-1.0, 1.0), label="normal x, y, z as red, green, blue")
+    )
 
 
 def mean_curvature(*, radius: int = 6) -> SurfaceProperty:
-    """Mean curvature [1/m] over `radius` pixels to each side: positive on a ball, negative in a bowl, 0 on a plane."""
+    """Mean curvature [1/m] over `radius` pixels to each side: positive on a ball, negative in a
+    bowl, 0 on a plane.
+    """
     if not 1 <= radius <= 50:
         raise InputError(f"curvature: radius must lie in 1..50 pixels, got {radius}")
 
@@ -34,11 +39,21 @@ def mean_curvature(*, radius: int = 6) -> SurfaceProperty:
         normals, camera = _normals_of(frame), frame.camera
         v, u = np.indices(frame.depth.shape, dtype=np.float32)
         z = frame.depth
-        points = np.dstack([(u - np.float32(camera.cx)) / np.float32(camera.fx) * z,
-                            (v - np.float32(camera.cy)) / np.float32(camera.fy) * z, z])
-        return 0.5 * (_bend(points, normals, radius) + _bend(points.swapaxes(0, 1), normals.swapaxes(0, 1), radius).T)
+        points = np.dstack(
+            [
+                (u - np.float32(camera.cx)) / np.float32(camera.fx) * z,
+                (v - np.float32(camera.cy)) / np.float32(camera.fy) * z,
+                z,
+            ]
+        )
+        return 0.5 * (
+            _bend(points, normals, radius)
+            + _bend(points.swapaxes(0, 1), normals.swapaxes(0, 1), radius).T
+        )
 
-    return SurfaceProperty("curvature", 1, function, Look("diverging", None, "mean curvature [1/m]"))
+    return SurfaceProperty(
+        "curvature", 1, function, Look("diverging", None, "mean curvature [1/m]")
+    )
 
 
 def _normals_of(frame: Frame) -> NDArray[np.float32]:
@@ -48,13 +63,15 @@ def _normals_of(frame: Frame) -> NDArray[np.float32]:
 
 
 def _bend(points: NDArray, normals: NDArray, radius: int) -> NDArray[np.float32]:
-    """Normal curvature [1/m] along image rows, (H, W), from the pixels `radius` away on both sides; NaN across an edge."""
+    """Normal curvature [1/m] along image rows, (H, W), from the pixels `radius` away on both sides;
+    NaN across an edge.
+    """
     bend = np.full(points.shape[:2], np.nan, np.float32)
     if points.shape[1] <= 2 * radius:
         return bend
-    step = points[:, 2 * radius:] - points[:, :-2 * radius]
-    turn = normals[:, 2 * radius:] - normals[:, :-2 * radius]
+    step = points[:, 2 * radius :] - points[:, : -2 * radius]
+    turn = normals[:, 2 * radius :] - normals[:, : -2 * radius]
     far = np.abs(step[..., 2]) > FARTHEST_JUMP * (1 + radius / 4) * points[:, radius:-radius, 2]
-    length = np.maximum((step ** 2).sum(axis=2), 1e-12)
+    length = np.maximum((step**2).sum(axis=2), 1e-12)
     bend[:, radius:-radius] = np.where(far, np.nan, (turn * step).sum(axis=2) / length)
     return bend

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.images import read_values
 from ..datasets.listing import list_names
 from ..errors import FrameError, InputError
+from ..files.images import read_values
 from ..types import Frame
 from .base import Look, SurfaceProperty
 
@@ -18,14 +18,21 @@ SUFFIXES = (".npy", ".png", ".jpg", ".jpeg")
 NUMBERS = re.compile(r"\d+")
 
 
-def folder_images(file: Path, *, colormap: str = "viridis", low: float | None = None,
-                  high: float | None = None) -> SurfaceProperty:
-    """The images in folder `file`: `.npy`, (H, W) or (H, W, c) numbers, or 8-bit and 16-bit pictures, taken as [0, 1].
+def folder_images(
+    file: Path, *, colormap: str = "viridis", low: float | None = None, high: float | None = None
+) -> SurfaceProperty:
+    """The images in folder `file`: `.npy`, (H, W) or (H, W, c) numbers, or 8-bit and 16-bit
+    pictures, taken as [0, 1].
 
-    A frame's image bears its name (`000017.npy` for `000017.png`) or its number (`17.npy` for `frame-000017.depth.png`). All
-    have the channels of the first. Values from `low` to `high` are coloured; without these, where most lie.
+    A frame's image bears its name (`000017.npy` for `000017.png`) or its number (`17.npy` for
+    `frame-000017.depth.png`). All have the channels of the first. Values from `low` to `high` are
+    coloured; without these, where most lie.
     """
-    files = {Path(name).stem: file / name for name in list_names(file) if Path(name).suffix.lower() in SUFFIXES}
+    files = {
+        Path(name).stem: file / name
+        for name in list_names(file)
+        if Path(name).suffix.lower() in SUFFIXES
+    }
     if not files:
         raise InputError(f"{file}: no *{', *'.join(SUFFIXES)} here")
     numbers = {_number(stem): path for stem, path in files.items()}
@@ -40,7 +47,9 @@ def folder_images(file: Path, *, colormap: str = "viridis", low: float | None = 
             raise FrameError(f"{file} holds no image of that name or number")
         values = read_values(path)
         if values.shape != (*frame.depth.shape, channels):
-            raise FrameError(f"{path}: is {values.shape}, but the frame needs {(*frame.depth.shape, channels)}")
+            raise FrameError(
+                f"{path}: is {values.shape}, but the frame needs {(*frame.depth.shape, channels)}"
+            )
         return values
 
     look = Look(colormap, None if low is None or high is None else (low, high), file.name)

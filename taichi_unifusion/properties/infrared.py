@@ -1,4 +1,6 @@
-"""Infrared: what an active infrared camera measures, as a data set gives it, brought into [0, 1] (Sec. V-A.2)."""
+"""Infrared: what an active infrared camera measures, as a data set gives it, brought into [0, 1]
+(Sec. V-A.2).
+"""
 
 from __future__ import annotations
 
@@ -10,37 +12,46 @@ from ..types import Frame
 from .base import Look, SurfaceProperty
 
 FULL_SCALE = 65535.0  # what data sets scale infrared to
-KNEE = 100.0          # units up to which the logarithmic curve is nearly straight: about a sensor's noise
+KNEE = 100.0  # units up to which the logarithmic curve is nearly straight: about a sensor's noise
 
 
 def log_infrared() -> SurfaceProperty:
-    """Logarithmic brightness: the light falls with the square of the distance, and a mug near the camera outshines a room.
+    """Logarithmic brightness: the light falls with the square of the distance, and a mug near the
+    camera outshines a room.
 
-    The same curve for every frame and recording, so that frames agree and maps can be merged: units of 0..65535 are
-    `100 (656.35^value - 1)`.
+    The same curve for every frame and recording, so that frames agree and maps can be merged: units
+    of 0..65535 are `100 (656.35^value - 1)`.
     """
     scale = 1 / np.log1p(FULL_SCALE / KNEE)
 
     def function(frame: Frame) -> NDArray:
         return np.log1p(_infrared_of(frame) / KNEE) * scale
 
-    return SurfaceProperty("infrared", 1, function, Look("inferno", None, "infrared brightness (logarithmic, 0..1)"))
+    return SurfaceProperty(
+        "infrared", 1, function, Look("inferno", None, "infrared brightness (logarithmic, 0..1)")
+    )
 
 
 def linear_infrared(*, low: float = 0.0, high: float = FULL_SCALE) -> SurfaceProperty:
-    """Brightness between `low` and `high`, in units of 0..65535, as [0, 1]; what lies outside is clipped."""
+    """Brightness between `low` and `high`, in units of 0..65535, as [0, 1]; what lies outside is
+    clipped.
+    """
     if not low < high:
         raise InputError(f"infrared: low must be below high, got {low} and {high}")
 
     def function(frame: Frame) -> NDArray:
         return np.clip((_infrared_of(frame) - np.float32(low)) / np.float32(high - low), 0, 1)
 
-    return SurfaceProperty("infrared", 1, function, Look("inferno", None, f"infrared ({low:g}..{high:g} as 0..1)"))
+    return SurfaceProperty(
+        "infrared", 1, function, Look("inferno", None, f"infrared ({low:g}..{high:g} as 0..1)")
+    )
 
 
 def _infrared_of(frame: Frame) -> NDArray[np.float32]:
     """The frame's infrared image (H, W) in units of 0..65535, or FrameError."""
     image = frame.images.get("infrared")
     if image is None:
-        raise FrameError("the recording has no infrared image for it (k4a has; folder and scannet in a folder infrared/)")
+        raise FrameError(
+            "the recording has no infrared image for it (k4a has; folder and scannet in a folder infrared/)"
+        )
     return image[..., 0]

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, check_choice
-from ..types import Frame
-from .base import Look, SurfaceProperty, color_of
 from ..networks.image_network import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -19,28 +17,35 @@ from ..networks.image_network import (
     check_preparation,
     prepare,
 )
+from ..types import Frame
+from .base import Look, SurfaceProperty, color_of
 
 LOOK = Look("viridis", (0.0, 1.0), "saliency")
-PICTURE = 96           # pixels of the longer side: coarse, so that objects count and not their texture
-BLUR = 2.5             # [pixels] of that picture
-BRIGHTEST = 99.5       # percentile that becomes 1
-RANGE_SLACK = 0.01     # of a network that gives [0, 1], for rounding
+PICTURE = 96  # pixels of the longer side: coarse, so that objects count and not their texture
+BLUR = 2.5  # [pixels] of that picture
+BRIGHTEST = 99.5  # percentile that becomes 1
+RANGE_SLACK = 0.01  # of a network that gives [0, 1], for rounding
 
 
 def signature_saliency() -> SurfaceProperty:
-    """The simple one: the image signature (Hou, Harel and Koch 2012) of lightness and colour; no weights, no learning.
+    """The simple one: the image signature (Hou, Harel and Koch 2012) of lightness and colour; no
+    weights, no learning.
 
-    It finds what is small and differs from the picture's general texture; a salient-object network finds whole objects.
+    It finds what is small and differs from the picture's general texture; a salient-object network
+    finds whole objects.
     """
 
     def function(frame: Frame) -> NDArray[np.float32]:
         color = color_of(frame)
         height, width = color.shape[:2]
         half = PICTURE / max(height, width) / 2
-        size = max(4, round(width * half)) * 2, max(4, round(height * half)) * 2  # even, as the transform needs it
+        # even, as the transform needs it
+        size = max(4, round(width * half)) * 2, max(4, round(height * half)) * 2
         small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
         lab = cv2.cvtColor(np.float32(small) / 255, cv2.COLOR_RGB2Lab)
-        salient = cv2.GaussianBlur(sum(signature_energy(channel) for channel in cv2.split(lab)), None, BLUR)
+        salient = cv2.GaussianBlur(
+            sum(signature_energy(channel) for channel in cv2.split(lab)), None, BLUR
+        )
         salient -= salient.min()
         salient /= max(float(np.percentile(salient, BRIGHTEST)), 1e-12)
         return np.clip(cv2.resize(salient, (width, height), interpolation=cv2.INTER_CUBIC), 0, 1)
@@ -49,19 +54,31 @@ def signature_saliency() -> SurfaceProperty:
 
 
 def signature_energy(channel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Energy (H, W) of what is left of an image when only the signs of its cosine transform are kept."""
+    """Energy (H, W) of what is left of an image when only the signs of its cosine transform are
+    kept.
+    """
     return cv2.idct(np.sign(cv2.dct(channel))) ** 2
 
 
-def network_saliency(file: Path, *, size: tuple[int, int] | None = None, mean: tuple[float, ...] = IMAGENET_MEAN,
-                     std: tuple[float, ...] = IMAGENET_STD, scale: float = 1.0, order: Literal["rgb", "bgr"] = "rgb",
-                     output: str = "", activation: Literal["none", "sigmoid", "minmax"] = "none",
-                     device: Literal["auto", "cpu", "cuda"] = "auto", sha256: str = "") -> SurfaceProperty:
-    """A salient-object network in an ONNX file (U2-Net, InSPyReNet and their like): an image in, one channel out.
+def network_saliency(
+    file: Path,
+    *,
+    size: tuple[int, int] | None = None,
+    mean: tuple[float, ...] = IMAGENET_MEAN,
+    std: tuple[float, ...] = IMAGENET_STD,
+    scale: float = 1.0,
+    order: Literal["rgb", "bgr"] = "rgb",
+    output: str = "",
+    activation: Literal["none", "sigmoid", "minmax"] = "none",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    sha256: str = "",
+) -> SurfaceProperty:
+    """A salient-object network in an ONNX file (U2-Net, InSPyReNet and their like): an image in,
+    one channel out.
 
-    The image is resized to `size` (the network's own where it is fixed), scaled to 0..`scale`, and normalised by `mean` and
-    `std`. `activation`: what is still to be done to the output named `output` (the first): nothing, sigmoid, or stretching each
-    frame to [0, 1].
+    The image is resized to `size` (the network's own where it is fixed), scaled to 0..`scale`, and
+    normalised by `mean` and `std`. `activation`: what is still to be done to the output named
+    `output` (the first): nothing, sigmoid, or stretching each frame to [0, 1].
     """
     check_choice("activation", activation, ("none", "sigmoid", "minmax"))
     check_preparation(scale, mean, std, order)
@@ -76,8 +93,10 @@ def network_saliency(file: Path, *, size: tuple[int, int] | None = None, mean: t
         if activation == "minmax":
             return (values - low) / max(high - low, 1e-12)
         if low < -RANGE_SLACK or high > 1 + RANGE_SLACK:
-            raise InputError(f"{file}: its output runs from {low:.3g} to {high:.3g}, which is no saliency of 0 to 1; say "
-                             "activation=sigmoid or activation=minmax, or choose another output")
+            raise InputError(
+                f"{file}: its output runs from {low:.3g} to {high:.3g}, which is no saliency of 0 to 1; say "
+                "activation=sigmoid or activation=minmax, or choose another output"
+            )
         return np.clip(values, 0, 1)
 
     return SurfaceProperty("saliency", 1, function, LOOK)

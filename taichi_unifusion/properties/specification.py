@@ -1,11 +1,13 @@
-"""Properties as text: `NAME`, `NAME=METHOD`, `NAME=METHOD:FILE`, each with `,option=value` after it.
+"""Properties as text: `NAME`, `NAME=METHOD`, `NAME=METHOD:FILE`, each with `,option=value` after
+it.
 
     saliency
     saliency=onnx:u2net.onnx,size=320x320,activation=minmax
     style=sketch,color=true,name=drawing,voxel_size=0.05
     images=heat/,name=heat
 
-Options are those of the method, `name` (of the map and its files), and the settings of a property map.
+Options are those of the method, `name` (of the map and its files), and the settings of a property
+map.
 """
 
 from __future__ import annotations
@@ -32,32 +34,54 @@ OPTION = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)=(.*)", re.DOTALL)
 
 
 def make_property(text: str, settings: PropertySettings | None = None) -> SurfaceProperty:
-    """The property that the text names; `settings` of its map where the text says nothing else, else the defaults.
+    """The property that the text names; `settings` of its map where the text says nothing else,
+    else the defaults.
 
-    Raises InputError, with the right names, for an unknown property, method or option or a value that does not fit, and
-    whatever making it raises: FileError for a model that is missing, MissingDependency for a package.
+    Raises InputError, with the right names, for an unknown property, method or option or a value
+    that does not fit, and whatever making it raises: FileError for a model that is missing,
+    MissingDependency for a package.
     """
     name, rest = NAME.fullmatch(text).groups(default="")
     methods = PROPERTIES.get(name)
     if methods is None:
-        raise InputError(f"property '{name}' is unknown{_suggest(name, PROPERTIES)}; properties: {', '.join(PROPERTIES)}")
+        raise InputError(
+            f"property '{name}' is unknown{_suggest(name, PROPERTIES)}; properties: {', '.join(PROPERTIES)}"
+        )
     method, file, options = _split(name, rest, methods)
     module, function = methods[method]
     maker = getattr(import_module(f".{module}", __package__), function)
     parameters = inspect.signature(maker).parameters
     if ("file" in parameters) != bool(file):
-        raise InputError(f"property '{text}': " + (f"'{name}={method}' takes no file" if file else
-                                                   f"give the file, as in {name}={method}:FILE"))
-    of_map = {field.name: field for field in dataclasses.fields(PropertySettings) if field.name != "encoder"}
+        raise InputError(
+            f"property '{text}': "
+            + (
+                f"'{name}={method}' takes no file"
+                if file
+                else f"give the file, as in {name}={method}:FILE"
+            )
+        )
+    of_map = {
+        field.name: field
+        for field in dataclasses.fields(PropertySettings)
+        if field.name != "encoder"
+    }
     known = [key for key in (*parameters, "name", *of_map) if key != "file"]
     for key in options:
         if key not in known:
-            raise InputError(f"property '{text}': option '{key}' is unknown{_suggest(key, known)}; options: {', '.join(known)}")
+            raise InputError(
+                f"property '{text}': option '{key}' is unknown{_suggest(key, known)}; options: {', '.join(known)}"
+            )
     types, map_types = get_type_hints(maker), get_type_hints(PropertySettings)
-    given = {key: _convert(value, types[key], f"property '{text}': {key}")
-             for key, value in options.items() if key in parameters}
-    changes = {key: _convert(value, map_types[key], f"property '{text}': {key}")
-               for key, value in options.items() if key in of_map}
+    given = {
+        key: _convert(value, types[key], f"property '{text}': {key}")
+        for key, value in options.items()
+        if key in parameters
+    }
+    changes = {
+        key: _convert(value, map_types[key], f"property '{text}': {key}")
+        for key, value in options.items()
+        if key in of_map
+    }
     made = maker(Path(file).expanduser(), **given) if file else maker(**given)
     settings = dataclasses.replace(settings or Config().property_map, **changes)
     return dataclasses.replace(made, name=options.get("name", name), settings=settings)
@@ -73,13 +97,17 @@ def _split(name: str, rest: str, methods: dict) -> tuple[str, str, dict[str, str
         elif len(methods) == 1:  # only one way to make it: what follows is its file
             file = first + colon + after
         else:
-            raise InputError(f"property '{name}': method '{first}' is unknown{_suggest(first, methods)}; methods: "
-                             f"{', '.join(methods)}")
+            raise InputError(
+                f"property '{name}': method '{first}' is unknown{_suggest(first, methods)}; methods: "
+                f"{', '.join(methods)}"
+            )
     options: dict[str, str] = {}
     for word in words:
         found = OPTION.fullmatch(word)
         if not found or found[1] in options:
-            raise InputError(f"property '{name}': '{word}' is {'given twice' if found else 'no option=value'}")
+            raise InputError(
+                f"property '{name}': '{word}' is {'given twice' if found else 'no option=value'}"
+            )
         options[found[1]] = found[2]
     return method, file, options
 
@@ -94,7 +122,9 @@ def _convert(text: str, wanted: Any, at: str) -> Any:
             return text
         if get_origin(wanted) is tuple:  # a size as 320x240, other numbers as 0.5/0.5/0.5
             whole = get_args(wanted)[0] is int
-            numbers = tuple(int(word) if whole else _number(word) for word in text.split("x" if whole else "/"))
+            numbers = tuple(
+                int(word) if whole else _number(word) for word in text.split("x" if whole else "/")
+            )
             if Ellipsis not in get_args(wanted) and len(numbers) != len(get_args(wanted)):
                 raise ValueError
             return numbers
@@ -105,7 +135,9 @@ def _convert(text: str, wanted: Any, at: str) -> Any:
         if isinstance(error, InputError):
             raise
         kinds = {float: "a number", int: "a whole number", bool: "true or false"}
-        kind = kinds.get(wanted) or ("WIDTHxHEIGHT" if get_args(wanted)[0] is int else "numbers with / between them")
+        kind = kinds.get(wanted) or (
+            "WIDTHxHEIGHT" if get_args(wanted)[0] is int else "numbers with / between them"
+        )
         raise InputError(f"{at}: expected {kind}, got '{text}'") from None
 
 

@@ -10,72 +10,96 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..networks.image_network import ImageNetwork, check_preparation, prepare
 from ..types import Frame
 from .base import Look, SurfaceProperty, color_of
-from ..networks.image_network import ImageNetwork, check_preparation, prepare
 
 LOOK = Look()
 CONTOUR_WIDTH = 2.0  # [pixels]
-FAINTEST = 0.017     # change of brightness a pixel from which there is a contour
+FAINTEST = 0.017  # change of brightness a pixel from which there is a contour
 OVERSHOOT = 10.0  # times the stated range that an output may reach before the range must be wrong
 
 
-def painting_style(*, smoothness: float = 60.0, detail: float = 0.45, contours: float = 4.0) -> SurfaceProperty:
+def painting_style(
+    *, smoothness: float = 60.0, detail: float = 0.45, contours: float = 4.0
+) -> SurfaceProperty:
     """Flat regions within dark contours, by OpenCV's edge-preserving filter; no weights.
 
-    `smoothness` in pixels, `detail` in 0..1, `contours` 0 for none. Every pixel depends on its surroundings only, not on the
-    frame's strongest edge, so that frames agree.
+    `smoothness` in pixels, `detail` in 0..1, `contours` 0 for none. Every pixel depends on its
+    surroundings only, not on the frame's strongest edge, so that frames agree.
     """
     _check_filter(smoothness, detail)
     if not contours >= 0:
         raise InputError(f"style: contours must not be negative, got {contours}")
 
     def function(frame: Frame) -> NDArray[np.float32]:
-        flat = cv2.edgePreservingFilter(color_of(frame), flags=cv2.RECURS_FILTER, sigma_s=smoothness, sigma_r=detail)
+        flat = cv2.edgePreservingFilter(
+            color_of(frame), flags=cv2.RECURS_FILTER, sigma_s=smoothness, sigma_r=detail
+        )
         flat = np.float32(flat) / 255
         soft = cv2.GaussianBlur(flat, None, CONTOUR_WIDTH)
-        slopes = (cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (0, 1))  # a pixel
-        strength = np.sqrt(sum(slope ** 2 for slope in slopes).max(axis=2, keepdims=True))
+        # a pixel
+        slopes = (cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (0, 1))
+        strength = np.sqrt(sum(slope**2 for slope in slopes).max(axis=2, keepdims=True))
         return flat * (1 - np.clip(contours * (strength - FAINTEST), 0, 1))
 
     return SurfaceProperty("style", 3, function, LOOK)
 
 
 def opencv_style(*, smoothness: float = 60.0, detail: float = 0.45) -> SurfaceProperty:
-    """OpenCV's stylisation; no weights. Its contours are as strong as the frame's strongest edge allows: frames differ more."""
+    """OpenCV's stylisation; no weights. Its contours are as strong as the frame's strongest edge
+    allows: frames differ more.
+    """
     _check_filter(smoothness, detail)
 
     def function(frame: Frame) -> NDArray[np.float32]:
         bgr = _bgr_of(frame)
-        grain = np.random.default_rng(0).integers(0, 2, bgr.shape, dtype=np.uint8)  # without it flat areas become black
-        painted = cv2.stylization(np.where(bgr < 128, bgr + grain, bgr - grain), sigma_s=smoothness, sigma_r=detail)
+        # without it flat areas become black
+        grain = np.random.default_rng(0).integers(0, 2, bgr.shape, dtype=np.uint8)
+        painted = cv2.stylization(
+            np.where(bgr < 128, bgr + grain, bgr - grain), sigma_s=smoothness, sigma_r=detail
+        )
         return _as_rgb(painted)
 
     return SurfaceProperty("style", 3, function, LOOK)
 
 
-def sketch_style(*, color: bool = False, smoothness: float = 60.0, detail: float = 0.07,
-                 shade: float = 0.05) -> SurfaceProperty:
+def sketch_style(
+    *, color: bool = False, smoothness: float = 60.0, detail: float = 0.07, shade: float = 0.05
+) -> SurfaceProperty:
     """OpenCV's pencil drawing, grey or in `color`; no weights. `shade` in 0..0.1 makes it darker."""
     _check_filter(smoothness, detail)
     if not 0 <= shade <= 0.1:
         raise InputError(f"style: shade must lie in 0..0.1, got {shade}")
 
     def function(frame: Frame) -> NDArray[np.float32]:
-        grey, colored = cv2.pencilSketch(_bgr_of(frame), sigma_s=smoothness, sigma_r=detail, shade_factor=shade)
+        grey, colored = cv2.pencilSketch(
+            _bgr_of(frame), sigma_s=smoothness, sigma_r=detail, shade_factor=shade
+        )
         return _as_rgb(colored if color else cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
 
     return SurfaceProperty("style", 3, function, LOOK)
 
 
-def network_style(file: Path, *, size: tuple[int, int] | None = None, mean: tuple[float, ...] = (0.0, 0.0, 0.0),
-                  std: tuple[float, ...] = (1.0, 1.0, 1.0), scale: float = 255.0, order: Literal["rgb", "bgr"] = "rgb",
-                  output: str = "", output_scale: float = 255.0, device: Literal["auto", "cpu", "cuda"] = "auto",
-                  sha256: str = "") -> SurfaceProperty:
-    """An image-to-image network in an ONNX file (fast neural style, MSG-Net and their like): an image in, an image out.
+def network_style(
+    file: Path,
+    *,
+    size: tuple[int, int] | None = None,
+    mean: tuple[float, ...] = (0.0, 0.0, 0.0),
+    std: tuple[float, ...] = (1.0, 1.0, 1.0),
+    scale: float = 255.0,
+    order: Literal["rgb", "bgr"] = "rgb",
+    output: str = "",
+    output_scale: float = 255.0,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    sha256: str = "",
+) -> SurfaceProperty:
+    """An image-to-image network in an ONNX file (fast neural style, MSG-Net and their like): an
+    image in, an image out.
 
-    The image is resized to `size` (the network's own where it is fixed), scaled to 0..`scale`, and normalised by `mean` and
-    `std`; the output named `output` (the first) runs over 0..`output_scale`. `order` holds for both.
+    The image is resized to `size` (the network's own where it is fixed), scaled to 0..`scale`, and
+    normalised by `mean` and `std`; the output named `output` (the first) runs over
+    0..`output_scale`. `order` holds for both.
     """
     if not output_scale > 0:
         raise InputError(f"style: output_scale must be positive, got {output_scale}")
@@ -87,9 +111,13 @@ def network_style(file: Path, *, size: tuple[int, int] | None = None, mean: tupl
         values = network(prepare(color, scale, mean, std, order), color.shape[:2])
         largest = float(np.abs(values).max())
         if largest > OVERSHOOT * output_scale or OVERSHOOT * largest < output_scale / 10:
-            raise InputError(f"{file}: its output reaches {largest:.3g}, which does not fit a range of 0 to {output_scale:g}; "
-                             f"say output_scale={'1' if largest < 10 else '255'}")
-        return np.clip((values if order == "rgb" else values[..., ::-1]) / np.float32(output_scale), 0, 1)
+            raise InputError(
+                f"{file}: its output reaches {largest:.3g}, which does not fit a range of 0 to {output_scale:g}; "
+                f"say output_scale={'1' if largest < 10 else '255'}"
+            )
+        return np.clip(
+            (values if order == "rgb" else values[..., ::-1]) / np.float32(output_scale), 0, 1
+        )
 
     return SurfaceProperty("style", 3, function, LOOK)
 
@@ -104,6 +132,8 @@ def _as_rgb(bgr: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def _check_filter(smoothness: float, detail: float) -> None:
     if not 0 < smoothness <= 200:
-        raise InputError(f"style: smoothness must lie above 0 and at most at 200 pixels, got {smoothness}")
+        raise InputError(
+            f"style: smoothness must lie above 0 and at most at 200 pixels, got {smoothness}"
+        )
     if not 0 < detail <= 1:
         raise InputError(f"style: detail must lie above 0 and at most at 1, got {detail}")

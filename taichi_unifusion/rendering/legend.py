@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Mesh
 from ..properties.base import Look
+from ..types import Mesh
 from .colormaps import color_table, colorize
 
-MOST = (1.0, 99.0)   # percentiles of the values that a colour map covers where a property states no range
-HEIGHT = 88          # pixels of a legend
+# percentiles of the values that a colour map covers where a property states no range
+MOST = (1.0, 99.0)
+HEIGHT = 88  # pixels of a legend
 INK, PAPER = (40, 40, 40), 255
 
 
@@ -36,17 +37,29 @@ def property_mesh(mesh: Mesh, name: str, look: Look) -> Mesh:
     values = mesh.attributes[name]
     attributes: Mapping[str, NDArray] = {name: values}
     if values.shape[1] in (1, 3):
-        attributes = {"color": colorize(values, look.colormap, *shown_range(values, look)), **attributes}
+        attributes = {
+            "color": colorize(values, look.colormap, *shown_range(values, look)),
+            **attributes,
+        }
     return Mesh(mesh.vertices, mesh.faces, mesh.normals, attributes)
 
 
-def draw_legend(width: int, name: str, look: Look, low: float, high: float, channels: int) -> NDArray[np.uint8]:
-    """A strip (HEIGHT, width, 3) RGB: a bar of the colours with the values at its ends and between, and what they are."""
+def draw_legend(
+    width: int, name: str, look: Look, low: float, high: float, channels: int
+) -> NDArray[np.uint8]:
+    """A strip (HEIGHT, width, 3) RGB: a bar of the colours with the values at its ends and between,
+    and what they are.
+    """
     strip = np.full((HEIGHT, width, 3), PAPER, np.uint8)
     title = look.label or name
     left, right = int(0.25 * width), int(0.75 * width)
     if channels == 3:
-        _write(strip, f"{title}: red, green and blue from {low:g} to {high:g}", width // 2, HEIGHT // 2 + 6)
+        _write(
+            strip,
+            f"{title}: red, green and blue from {low:g} to {high:g}",
+            width // 2,
+            HEIGHT // 2 + 6,
+        )
         return strip
     table = color_table(look.colormap)
     bar = table[np.linspace(0, 255, right - left).round().astype(int)]
@@ -54,11 +67,20 @@ def draw_legend(width: int, name: str, look: Look, low: float, high: float, chan
     _write(strip, title, width // 2, 26)
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         x = left + round(share * (right - left - 1))
-        strip[56:61, max(x - 1, 0):x + 1] = INK
+        strip[56:61, max(x - 1, 0) : x + 1] = INK
         _write(strip, f"{low + share * (high - low):.3g}", x, 78)
     return strip
 
 
 def _write(strip: NDArray[np.uint8], text: str, center: int, baseline: int) -> None:
     (length, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.55, 1)
-    cv2.putText(strip, text, (max(center - length // 2, 2), baseline), cv2.FONT_HERSHEY_SIMPLEX, 0.55, INK, 1, cv2.LINE_AA)
+    cv2.putText(
+        strip,
+        text,
+        (max(center - length // 2, 2), baseline),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        0.55,
+        INK,
+        1,
+        cv2.LINE_AA,
+    )

@@ -22,23 +22,27 @@ VIEWS = {  # name -> what it shows
     "opposite": "the overview from another side",
 }
 BACKGROUND = (0.965, 0.97, 0.975)
-GREY = 0.78                   # of a mesh without colour
-SHADING = {True: 0.22, False: 0.6}  # how much light changes the colours of a mesh with and without colour
-LIGHT = (-0.35, -0.75, -0.55)  # towards it in the camera frame: above, a little left, behind the camera
-OCCLUSION_RADIUS = 0.25       # [m] of ambient occlusion
-OCCLUSION_TAPS = 4            # per sample; the four samples of a pixel look in different directions
-SAMPLES = 2                   # per pixel and axis
+GREY = 0.78  # of a mesh without colour
+# how much light changes the colours of a mesh with and without colour
+SHADING = {True: 0.22, False: 0.6}
+# towards it in the camera frame: above, a little left, behind the camera
+LIGHT = (-0.35, -0.75, -0.55)
+OCCLUSION_RADIUS = 0.25  # [m] of ambient occlusion
+OCCLUSION_TAPS = 4  # per sample; the four samples of a pixel look in different directions
+SAMPLES = 2  # per pixel and axis
 
-JUDGED_FOV = math.radians(55)     # vertical; wider than what a camera records, to count its surroundings too
-CANDIDATES = 12                   # recorded cameras, evenly over the recording, to choose one from
-THUMBNAIL = (64, 48)              # pixels to judge one by
-CAMERA_FOV = math.radians(48)    # vertical
-DRAWN_BACK = 0.15                # of the typical depth, to show the surroundings too
+# vertical; wider than what a camera records, to count its surroundings too
+JUDGED_FOV = math.radians(55)
+CANDIDATES = 12  # recorded cameras, evenly over the recording, to choose one from
+THUMBNAIL = (64, 48)  # pixels to judge one by
+CAMERA_FOV = math.radians(48)  # vertical
+DRAWN_BACK = 0.15  # of the typical depth, to show the surroundings too
 OVERVIEW_FOV = math.radians(32)  # vertical; narrow, so that upright edges stay nearly parallel
-ELEVATION = math.radians(48)     # of the overview
+ELEVATION = math.radians(48)  # of the overview
 AZIMUTHS = 24
-MARGIN = 1.04                 # of the picture around what is fitted into it
-STRAY = 0.002                 # share of the surface that may lie outside each side, so that specks do not shrink the rest
+MARGIN = 1.04  # of the picture around what is fitted into it
+# share of the surface that may lie outside each side, so that specks do not shrink the rest
+STRAY = 0.002
 
 
 @dataclass(frozen=True)
@@ -50,26 +54,46 @@ class View:
     near: float = 0.05
 
 
-def render_preview(mesh: Mesh, path: str | os.PathLike, *, trajectory: Trajectory | None = None,
-                   views: Sequence[str] | None = None, size: tuple[int, int] = (960, 720)) -> None:
+def render_preview(
+    mesh: Mesh,
+    path: str | os.PathLike,
+    *,
+    trajectory: Trajectory | None = None,
+    views: Sequence[str] | None = None,
+    size: tuple[int, int] = (960, 720),
+) -> None:
     """Write what `draw_preview` gives as a PNG; raises FileError on writing."""
     write_png(path, draw_preview(mesh, trajectory=trajectory, views=views, size=size))
 
 
-def draw_preview(mesh: Mesh, *, trajectory: Trajectory | None = None, views: Sequence[str] | None = None,
-                 size: tuple[int, int] = (960, 720)) -> NDArray[np.uint8]:
-    """One picture (H, W, 3) RGB of views of `mesh`, each of `size` (width, height) pixels, side by side.
+def draw_preview(
+    mesh: Mesh,
+    *,
+    trajectory: Trajectory | None = None,
+    views: Sequence[str] | None = None,
+    size: tuple[int, int] = (960, 720),
+) -> NDArray[np.uint8]:
+    """One picture (H, W, 3) RGB of views of `mesh`, each of `size` (width, height) pixels, side by
+    side.
 
-    `views` are names of VIEWS: camera and overview where there are poses, else overview and opposite. Up is the mean of the
-    cameras' up, or +z. Raises InputError for a mesh without a finite triangle or an unknown view.
+    `views` are names of VIEWS: camera and overview where there are poses, else overview and
+    opposite. Up is the mean of the cameras' up, or +z. Raises InputError for a mesh without a
+    finite triangle or an unknown view.
     """
     has_poses = trajectory is not None and len(trajectory) > 0
-    names = tuple(views) if views else (("camera", "overview") if has_poses else ("overview", "opposite"))
+    names = (
+        tuple(views)
+        if views
+        else (("camera", "overview") if has_poses else ("overview", "opposite"))
+    )
     for name in names:
         if name not in VIEWS:
             close = difflib.get_close_matches(str(name), VIEWS, 1)
-            raise InputError(f"preview: unknown view '{name}', " + (f"did you mean '{close[0]}'? " if close else "")
-                             + f"There are {', '.join(VIEWS)}")
+            raise InputError(
+                f"preview: unknown view '{name}', "
+                + (f"did you mean '{close[0]}'? " if close else "")
+                + f"There are {', '.join(VIEWS)}"
+            )
         if name == "camera" and not has_poses:
             raise InputError("preview: view 'camera' needs a trajectory")
     drawable = _drawable(mesh)
@@ -80,7 +104,9 @@ def draw_preview(mesh: Mesh, *, trajectory: Trajectory | None = None, views: Seq
 
 
 def render_mesh(mesh: Mesh, view: View) -> NDArray[np.uint8]:
-    """Picture (H, W, 3) RGB of the sides of `mesh` that face the camera; InputError for a mesh without a finite triangle."""
+    """Picture (H, W, 3) RGB of the sides of `mesh` that face the camera; InputError for a mesh
+    without a finite triangle.
+    """
     return _draw(_drawable(mesh), view)
 
 
@@ -92,9 +118,9 @@ class _Drawable:
     """A mesh that kernels can take as it is: finite, indices checked, with normals and colours."""
 
     vertices: NDArray[np.float32]  # (V, 3) world [m]
-    faces: NDArray[np.int32]       # (F, 3)
-    normals: NDArray[np.float32]   # (V, 3) unit
-    colors: NDArray[np.float32]    # (V, 3) RGB in [0, 1]
+    faces: NDArray[np.int32]  # (F, 3)
+    normals: NDArray[np.float32]  # (V, 3) unit
+    colors: NDArray[np.float32]  # (V, 3) RGB in [0, 1]
     shading: float
 
 
@@ -102,20 +128,35 @@ def _drawable(mesh: Mesh) -> _Drawable:
     vertices = np.ascontiguousarray(mesh.vertices, np.float32)
     faces = np.ascontiguousarray(mesh.faces, np.int32)
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise InputError(f"preview: the faces name vertices {faces.min()}..{faces.max()}, but the mesh has {len(vertices)}")
+        raise InputError(
+            f"preview: the faces name vertices {faces.min()}..{faces.max()}, but the mesh has {len(vertices)}"
+        )
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         faces = np.ascontiguousarray(faces[finite[faces].all(axis=1)])
         vertices = np.where(finite[:, None], vertices, np.float32(0))
     if not len(faces):
         raise InputError("preview: the mesh is empty, there is nothing to draw")
-    normals = _vertex_normals(vertices, faces) if mesh.normals is None else np.nan_to_num(mesh.normals)
+    normals = (
+        _vertex_normals(vertices, faces) if mesh.normals is None else np.nan_to_num(mesh.normals)
+    )
     color = mesh.attributes.get("color")
     if color is not None and color.shape[1:] != (3,):
-        raise InputError(f"preview: attribute 'color' must be (V, 3) RGB in [0, 1], got {color.shape}")
-    colors = np.full_like(vertices, GREY) if color is None else np.clip(np.nan_to_num(color, nan=0.0), 0, 1)
-    return _Drawable(vertices, faces, np.ascontiguousarray(normals, np.float32), np.ascontiguousarray(colors, np.float32),
-                     SHADING[color is not None])
+        raise InputError(
+            f"preview: attribute 'color' must be (V, 3) RGB in [0, 1], got {color.shape}"
+        )
+    colors = (
+        np.full_like(vertices, GREY)
+        if color is None
+        else np.clip(np.nan_to_num(color, nan=0.0), 0, 1)
+    )
+    return _Drawable(
+        vertices,
+        faces,
+        np.ascontiguousarray(normals, np.float32),
+        np.ascontiguousarray(colors, np.float32),
+        SHADING[color is not None],
+    )
 
 
 def _vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray[np.float32]:
@@ -123,8 +164,12 @@ def _vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray[np.float32]:
     corner = vertices[faces]
     normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     weights = np.repeat(normals, 3, axis=0)
-    total = np.stack([np.bincount(faces.ravel(), weights[:, k], len(vertices)) for k in range(3)], axis=1)
-    return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)).astype(np.float32)
+    total = np.stack(
+        [np.bincount(faces.ravel(), weights[:, k], len(vertices)) for k in range(3)], axis=1
+    )
+    return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)).astype(
+        np.float32
+    )
 
 
 def _draw(drawable: _Drawable, view: View) -> NDArray[np.uint8]:
@@ -137,14 +182,27 @@ def _draw(drawable: _Drawable, view: View) -> NDArray[np.uint8]:
     T_camera_world = np.linalg.inv(view.T_world_camera)
     image = np.empty((view.camera.height, view.camera.width, 3), np.uint8)
     light = np.array(LIGHT) / np.linalg.norm(LIGHT)
-    shade_pixels(drawable.vertices, drawable.normals, drawable.colors, drawable.faces, projection,
-                 ti.math.mat3(T_camera_world[:3, :3].tolist()), ti.math.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
-                 nearest, ti.math.vec4(*light, drawable.shading), OCCLUSION_RADIUS, OCCLUSION_TAPS,
-                 ti.math.vec3(BACKGROUND), image)
+    shade_pixels(
+        drawable.vertices,
+        drawable.normals,
+        drawable.colors,
+        drawable.faces,
+        projection,
+        ti.math.mat3(T_camera_world[:3, :3].tolist()),
+        ti.math.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+        nearest,
+        ti.math.vec4(*light, drawable.shading),
+        OCCLUSION_RADIUS,
+        OCCLUSION_TAPS,
+        ti.math.vec3(BACKGROUND),
+        image,
+    )
     return image
 
 
-def _rasterize(drawable: _Drawable, camera: PinholeCamera, T_world_camera: NDArray, near: float) -> tuple[NDArray, NDArray]:
+def _rasterize(
+    drawable: _Drawable, camera: PinholeCamera, T_world_camera: NDArray, near: float
+) -> tuple[NDArray, NDArray]:
     """Depth buffer (H, W) and projection (3, 4) as in kernels/raster.py."""
     runtime.current()  # before Taichi is imported: it says what it starts
     from .kernels.raster import rasterize
@@ -176,12 +234,14 @@ class _Surface:
     normals: NDArray[np.float64]  # (N, 3) unit
 
 
-def _choose_views(drawable: _Drawable, trajectory: Trajectory | None, names: Sequence[str],
-                  size: tuple[int, int]) -> list[View]:
+def _choose_views(
+    drawable: _Drawable, trajectory: Trajectory | None, names: Sequence[str], size: tuple[int, int]
+) -> list[View]:
     surface = _sample_surface(drawable)
     matrices = () if trajectory is None else trajectory.T_world_camera
     poses = [check_rigid(T, f"preview: pose {i}") for i, T in enumerate(matrices)]
-    mean_up = -np.mean([T[:3, 1] for T in poses], axis=0) if poses else np.zeros(3)  # y of a camera points down
+    # y of a camera points down
+    mean_up = -np.mean([T[:3, 1] for T in poses], axis=0) if poses else np.zeros(3)
     length = float(np.linalg.norm(mean_up))
     up = mean_up / length if length > 0.2 else _guess_up(surface)
     directions = _overview_directions(up)
@@ -199,23 +259,31 @@ def _choose_views(drawable: _Drawable, trajectory: Trajectory | None, names: Seq
 
 def _sample_surface(drawable: _Drawable, count: int = 30_000) -> _Surface:
     corners = drawable.vertices[drawable.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).astype(
+        np.float64
+    )
     double_areas = np.linalg.norm(normals, axis=1)
     total = np.cumsum(double_areas)
     if not 0 < total[-1] < math.inf:
-        raise InputError("preview: the triangles of the mesh have no area, or are too large to draw")
+        raise InputError(
+            "preview: the triangles of the mesh have no area, or are too large to draw"
+        )
     picked = np.searchsorted(total, (np.arange(count) + 0.5) * (total[-1] / count))
     corners = corners[picked].astype(np.float64)
     return _Surface(corners, corners.mean(axis=1), normals[picked] / double_areas[picked, None])
 
 
 def _shown_area(surface: _Surface, directions: NDArray) -> NDArray[np.float64]:
-    """Share of the surface's area that shows from each direction (N, 3), foreshortened, hidden parts counted too."""
+    """Share of the surface's area that shows from each direction (N, 3), foreshortened, hidden
+    parts counted too.
+    """
     return np.maximum(surface.normals @ directions.T, 0).mean(axis=0)
 
 
 def _guess_up(surface: _Surface) -> NDArray[np.float64]:
-    """+z, unless a view from above would mostly show backs: then the up of a camera frame (-y), or what shows most."""
+    """+z, unless a view from above would mostly show backs: then the up of a camera frame (-y), or
+    what shows most.
+    """
     ups = np.array([[0, 0, 1.0], [0, -1.0, 0], [0, 1.0, 0], [0, 0, -1.0]])
     shown = np.array([_shown_area(surface, _overview_directions(up)).max() for up in ups])
     return ups[int((shown >= 0.6 * shown.max()).argmax())]
@@ -249,11 +317,16 @@ def _view(R_world_camera: NDArray, eye: NDArray, camera: PinholeCamera, near: fl
     return View(camera, T_world_camera, near)
 
 
-def _fitted_eye(points: NDArray, R: NDArray, camera: PinholeCamera, stray: float) -> NDArray[np.float64]:
-    """Where a camera of orientation R stands so that `points`, (N, 3) world [m], but for some strays just fill its picture."""
+def _fitted_eye(
+    points: NDArray, R: NDArray, camera: PinholeCamera, stray: float
+) -> NDArray[np.float64]:
+    """Where a camera of orientation R stands so that `points`, (N, 3) world [m], but for some
+    strays just fill its picture.
+    """
     points = points @ R  # right, down, forward [m]
     tangents = np.array([camera.width / camera.fx, camera.height / camera.fy]) / (2 * MARGIN)
-    # a point is in the picture where |p - eye| <= tangent * (forward distance): one number a side decides
+    # a point is in the picture where |p - eye| <= tangent * (forward distance): one number a side
+    # decides
     high = np.quantile(points[:, :2] - tangents * points[:, 2:], 1 - stray, axis=0)
     low = np.quantile(points[:, :2] + tangents * points[:, 2:], stray, axis=0)
     return R @ np.array([*(high + low) / 2, ((low - high) / (2 * tangents)).min()])
@@ -264,27 +337,41 @@ def _overview(surface: _Surface, direction: NDArray, up: NDArray, size: tuple[in
     R = _rotation_looking(-direction, up)
     camera = _pinhole(size, OVERVIEW_FOV)
     seen = surface.normals @ direction > 0
-    eye = _fitted_eye(surface.corners[seen if seen.any() else ~seen].reshape(-1, 3), R, camera, STRAY)
+    eye = _fitted_eye(
+        surface.corners[seen if seen.any() else ~seen].reshape(-1, 3), R, camera, STRAY
+    )
     depth = (surface.corners.reshape(-1, 3) - eye) @ R[:, 2]
     return _view(R, eye, camera, max(1e-3 * depth.max(), 0.2 * depth.min()))
 
 
 def _camera_view(drawable: _Drawable, poses: NDArray, up: NDArray, size: tuple[int, int]) -> View:
-    """The view of the recorded camera that sees most, levelled and drawn back; what it left behind stays cut away."""
-    candidates = poses[np.unique(np.linspace(0, len(poses) - 1, min(len(poses), CANDIDATES)).astype(int))]
+    """The view of the recorded camera that sees most, levelled and drawn back; what it left behind
+    stays cut away.
+    """
+    candidates = poses[
+        np.unique(np.linspace(0, len(poses) - 1, min(len(poses), CANDIDATES)).astype(int))
+    ]
     seen = [_seen_depth(drawable, T_world_camera) for T_world_camera in candidates]
-    scores = [np.sqrt(depth).sum() * (depth > 0).sum() for depth in seen]  # few holes first, then much space
+    # few holes first, then much space
+    scores = [np.sqrt(depth).sum() * (depth > 0).sum() for depth in seen]
     best = int(np.argmax(scores))
     T_world_camera, depth = candidates[best], seen[best]
     typical_depth = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     forward = T_world_camera[:3, 2]
     R = _rotation_looking(forward, up if abs(forward @ up) < 0.95 else -T_world_camera[:3, 1])
     back = DRAWN_BACK * typical_depth  # along the line of sight only: beside it there may be a wall
-    return _view(R, T_world_camera[:3, 3] - back * forward, _pinhole(size, CAMERA_FOV), back + 0.03 * typical_depth)
+    return _view(
+        R,
+        T_world_camera[:3, 3] - back * forward,
+        _pinhole(size, CAMERA_FOV),
+        back + 0.03 * typical_depth,
+    )
 
 
 def _seen_depth(drawable: _Drawable, T_world_camera: NDArray) -> NDArray[np.float32]:
-    """A small depth image [m] of the mesh from a recorded camera, 0 where there is none or its back is seen."""
+    """A small depth image [m] of the mesh from a recorded camera, 0 where there is none or its back
+    is seen.
+    """
     nearest, _ = _rasterize(drawable, _pinhole(THUMBNAIL, JUDGED_FOV), T_world_camera, View.near)
     depth = (nearest >> 32).astype(np.int32).view(np.float32)
     return np.where(nearest == np.iinfo(np.int64).max, np.float32(0), depth)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..types import Mesh, PinholeCamera, check_rigid
 from ..geometry.triangles import check_mesh
+from ..types import Mesh, PinholeCamera, check_rigid
 
 NEAR = 1e-3  # [m] nothing nearer to the camera is hit
 
@@ -18,8 +18,8 @@ NEAR = 1e-3  # [m] nothing nearer to the camera is hit
 class RayHits:
     """What the rays through the pixel centres of one camera hit first."""
 
-    depth: NDArray[np.float32]           # (H, W) [m] along the optical axis; inf where nothing is hit
-    triangle: NDArray[np.int32]          # (H, W) -1 where nothing is hit
+    depth: NDArray[np.float32]  # (H, W) [m] along the optical axis; inf where nothing is hit
+    triangle: NDArray[np.int32]  # (H, W) -1 where nothing is hit
     camera: PinholeCamera
     T_world_camera: NDArray[np.float64]  # (4, 4)
 
@@ -32,26 +32,33 @@ class RayHits:
         """Directions (N, 3) of the pixels in `mask` in the camera frame, of unit depth, row by row."""
         v, u = np.nonzero(mask)
         camera = self.camera
-        return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1)
+        return np.stack(
+            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1
+        )
 
     def points(self, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Points hit (N, 3) world [m] by the pixels in `mask`, row by row."""
         T = self.T_world_camera
-        return ((self.rays(mask) * self.depth[mask][:, None]) @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
+        return ((self.rays(mask) * self.depth[mask][:, None]) @ T[:3, :3].T + T[:3, 3]).astype(
+            np.float32
+        )
 
 
 class RayCaster:
-    """A mesh to cast rays at. Raises InputError where the mesh is empty, not finite or inconsistent.
+    """A mesh to cast rays at. Raises InputError where the mesh is empty, not finite or
+    inconsistent.
 
-    The rays of a pinhole camera's pixel grid need no search tree: drawing the triangles into a depth buffer, at the pixel
-    centres and in double precision, gives the same depths.
+    The rays of a pinhole camera's pixel grid need no search tree: drawing the triangles into a
+    depth buffer, at the pixel centres and in double precision, gives the same depths.
     """
 
     def __init__(self, mesh: Mesh, name: str = "mesh") -> None:
         self.mesh = check_mesh(mesh, name)
 
     def cast(self, camera: PinholeCamera, T_world_camera: NDArray) -> RayHits:
-        """What every pixel of the camera sees; raises PoseError for a pose that is no rigid transform."""
+        """What every pixel of the camera sees; raises PoseError for a pose that is no rigid
+        transform.
+        """
         T_world_camera = check_rigid(T_world_camera)
         runtime.current()  # before Taichi is imported: it says what it starts
         from .kernels.raster import EMPTY, rasterize
@@ -64,13 +71,23 @@ class RayCaster:
         triangle = np.where(empty, -1, nearest & 0xFFFFFFFF).astype(np.int32)
         return RayHits(np.where(empty, np.float32(np.inf), depth), triangle, camera, T_world_camera)
 
-    def interpolate(self, hits: RayHits, mask: NDArray[np.bool_], values: NDArray) -> NDArray[np.float32]:
-        """Vertex values (V, c), linear over each triangle, at the points that the pixels in `mask` hit: (N, c)."""
+    def interpolate(
+        self, hits: RayHits, mask: NDArray[np.bool_], values: NDArray
+    ) -> NDArray[np.float32]:
+        """Vertex values (V, c), linear over each triangle, at the points that the pixels in `mask`
+        hit: (N, c).
+        """
         R, t = hits.T_world_camera[:3, :3], hits.T_world_camera[:3, 3]
         faces = self.mesh.faces[hits.triangle[mask]]
         a, b, c = ((self.mesh.vertices[faces[:, k]] - t) @ R for k in range(3))  # camera frame
         rays = hits.rays(mask)
-        weights = np.stack([np.einsum("nd,nd->n", rays, np.cross(p, q)) for p, q in ((b, c), (c, a), (a, b))], axis=1)
-        weights = np.maximum(weights * np.sign(weights.sum(axis=1, keepdims=True)), 0)  # either side of the triangle
+        weights = np.stack(
+            [np.einsum("nd,nd->n", rays, np.cross(p, q)) for p, q in ((b, c), (c, a), (a, b))],
+            axis=1,
+        )
+        # either side of the triangle
+        weights = np.maximum(weights * np.sign(weights.sum(axis=1, keepdims=True)), 0)
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
-        return np.einsum("nk,nkc->nc", weights, np.asarray(values, np.float64)[faces]).astype(np.float32)
+        return np.einsum("nk,nkc->nc", weights, np.asarray(values, np.float64)[faces]).astype(
+            np.float32
+        )

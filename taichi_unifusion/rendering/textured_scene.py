@@ -1,6 +1,8 @@
-"""A textured triangle scene from a file (GLB, OBJ, PLY), as the arrays that the renderer's kernels read.
+"""A textured triangle scene from a file (GLB, OBJ, PLY), as the arrays that the renderer's kernels
+read.
 
-Opaque surfaces only, drawn from both sides: alpha is ignored. Textures repeat; of a material only its base colour is used.
+Opaque surfaces only, drawn from both sides: alpha is ignored. Textures repeat; of a material only
+its base colour is used.
 """
 
 from __future__ import annotations
@@ -21,33 +23,35 @@ from .. import runtime
 from ..errors import CapacityError, DatasetError, MissingDependency, UniFusionError
 from ..types import Mesh, PinholeCamera, check_rigid
 
-NEAR_PLANE = 0.02                   # [m] nothing nearer is drawn
-LIGHT = (0.36, 0.24, 0.9)           # towards the light, world; not unit
-BACKGROUND = (0.72, 0.80, 0.88)     # RGB in [0, 1] where a ray leaves the scene
-GREY = 178                          # of 255: a mesh without any colour
-MAX_TEXELS = 2**31 // 3             # an array of Taichi holds at most 2^31 - 1 numbers
+NEAR_PLANE = 0.02  # [m] nothing nearer is drawn
+LIGHT = (0.36, 0.24, 0.9)  # towards the light, world; not unit
+BACKGROUND = (0.72, 0.80, 0.88)  # RGB in [0, 1] where a ray leaves the scene
+GREY = 178  # of 255: a mesh without any colour
+MAX_TEXELS = 2**31 // 3  # an array of Taichi holds at most 2^31 - 1 numbers
 
 
 @dataclass(frozen=True)
 class View:
     """What a camera sees at the pixels' centres; colour is the mean over the pixel."""
 
-    depth: NDArray[np.float32]    # (H, W) [m], 0 where nothing is hit
-    color: NDArray[np.uint8]      # (H, W, 3) RGB
-    object: NDArray[np.int32]     # (H, W) row of object_names, -1 where nothing is hit
-    cosine: NDArray[np.float32]   # (H, W) of the angle of incidence
+    depth: NDArray[np.float32]  # (H, W) [m], 0 where nothing is hit
+    color: NDArray[np.uint8]  # (H, W, 3) RGB
+    object: NDArray[np.int32]  # (H, W) row of object_names, -1 where nothing is hit
+    cosine: NDArray[np.float32]  # (H, W) of the angle of incidence
 
 
 @dataclass(frozen=True, eq=False)
 class TexturedScene:
-    """Triangles with texture coordinates, textures with their mip levels, and which object each triangle belongs to."""
+    """Triangles with texture coordinates, textures with their mip levels, and which object each
+    triangle belongs to.
+    """
 
-    vertices: NDArray[np.float32]      # (V, 3) world [m]
-    colors: NDArray[np.float32]        # (V, 3) RGB in [0, 1]: vertex colour times base colour
-    faces: NDArray[np.int32]           # (F, 3)
-    corners: NDArray[np.float32]       # (F, 6) texture coordinates of the corners, right and down
-    face_texture: NDArray[np.int32]    # (F,) -1: none
-    face_object: NDArray[np.int32]     # (F,)
+    vertices: NDArray[np.float32]  # (V, 3) world [m]
+    colors: NDArray[np.float32]  # (V, 3) RGB in [0, 1]: vertex colour times base colour
+    faces: NDArray[np.int32]  # (F, 3)
+    corners: NDArray[np.float32]  # (F, 6) texture coordinates of the corners, right and down
+    face_texture: NDArray[np.int32]  # (F,) -1: none
+    face_object: NDArray[np.int32]  # (F,)
     object_names: tuple[str, ...]
     textures: tuple[NDArray[np.uint8], ...]  # (h, w, 3) RGB each
 
@@ -56,7 +60,9 @@ class TexturedScene:
         return Mesh(self.vertices, self.faces)
 
     def render(self, camera: PinholeCamera, T_world_camera: NDArray) -> View:
-        """Depth, colour and objects that `camera` sees from T_world_camera; PoseError if that is no rigid transform."""
+        """Depth, colour and objects that `camera` sees from T_world_camera; PoseError if that is no
+        rigid transform.
+        """
         on_device = self._on_device
         import taichi as ti
 
@@ -66,9 +72,21 @@ class TexturedScene:
         nearest, projection = self._rasterize(finer, T_world_camera)
         color = np.empty((camera.height, camera.width, 3), np.uint8)
         light = np.array(LIGHT) / np.linalg.norm(LIGHT)
-        shade_textured(on_device.vertices, on_device.colors, on_device.faces, on_device.corners, on_device.face_texture,
-                       on_device.textures, on_device.levels, on_device.texels, projection, ti.math.vec3(light),
-                       ti.math.vec3(BACKGROUND), nearest, color)
+        shade_textured(
+            on_device.vertices,
+            on_device.colors,
+            on_device.faces,
+            on_device.corners,
+            on_device.face_texture,
+            on_device.textures,
+            on_device.levels,
+            on_device.texels,
+            projection,
+            ti.math.vec3(light),
+            ti.math.vec3(BACKGROUND),
+            nearest,
+            color,
+        )
         return View(color=color, **self._surfaces(camera, T_world_camera))
 
     def render_depth(self, camera: PinholeCamera, T_world_camera: NDArray) -> NDArray[np.float32]:
@@ -79,12 +97,16 @@ class TexturedScene:
         """Object (H, W) alone, row of object_names, -1 where nothing is hit."""
         return self._surfaces(camera, T_world_camera)["object"]
 
-    def _rasterize(self, camera: PinholeCamera, T_world_camera: NDArray) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _rasterize(
+        self, camera: PinholeCamera, T_world_camera: NDArray
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Depth buffer (H, W) and projection (3, 4) as in kernels/raster.py."""
         on_device = self._on_device
         from .kernels.raster import rasterize
 
-        projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(check_rigid(T_world_camera))[:3])
+        projection = np.ascontiguousarray(
+            camera.matrix @ np.linalg.inv(check_rigid(T_world_camera))[:3]
+        )
         nearest = np.empty((camera.height, camera.width), np.int64)
         rasterize(on_device.vertices, on_device.faces, 1, projection, NEAR_PLANE, nearest)
         return nearest, projection
@@ -98,13 +120,24 @@ class TexturedScene:
 
         depth, cosine = (np.empty(nearest.shape, np.float32) for _ in range(2))
         objects = np.empty(nearest.shape, np.int32)
-        read_surfaces(self._on_device.vertices, self._on_device.faces, self._on_device.face_object, ti.Matrix(T_world_camera),
-                      ti.math.vec4(camera.fx, camera.fy, camera.cx, camera.cy), nearest, depth, cosine, objects)
+        read_surfaces(
+            self._on_device.vertices,
+            self._on_device.faces,
+            self._on_device.face_object,
+            ti.Matrix(T_world_camera),
+            ti.math.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+            nearest,
+            depth,
+            cosine,
+            objects,
+        )
         return {"depth": depth, "cosine": cosine, "object": objects}
 
     @cached_property
     def _on_device(self) -> SimpleNamespace:
-        """The arrays that kernels take, textures with all their mip levels, moved to the device once."""
+        """The arrays that kernels take, textures with all their mip levels, moved to the device
+        once.
+        """
         runtime.current()  # before Taichi is imported: it says what it starts
         import taichi as ti
 
@@ -115,7 +148,8 @@ class TexturedScene:
 
         levels, texels, rows = [], [], []
         offset = 0
-        for texture in self.textures or (np.zeros((1, 1, 3), np.uint8),):  # kernels take no empty arrays
+        # kernels take no empty arrays
+        for texture in self.textures or (np.zeros((1, 1, 3), np.uint8),):
             pyramid = mip_levels(texture)
             rows.append((len(levels), len(pyramid)))
             for level in pyramid:
@@ -123,12 +157,22 @@ class TexturedScene:
                 texels.append(level.reshape(-1, 3))
                 offset += len(texels[-1])
         if offset > MAX_TEXELS:
-            raise CapacityError(f"the scene's textures have {offset:,} texels, more than {MAX_TEXELS:,}; make them smaller")
+            raise CapacityError(
+                f"the scene's textures have {offset:,} texels, more than {MAX_TEXELS:,}; make them smaller"
+            )
         return SimpleNamespace(
-            **{name: move(getattr(self, name), ti.f32) for name in ("vertices", "colors", "corners")},
-            **{name: move(getattr(self, name), ti.i32) for name in ("faces", "face_texture", "face_object")},
-            textures=move(np.array(rows, np.int32), ti.i32), levels=move(np.array(levels, np.int32), ti.i32),
-            texels=move(np.concatenate(texels), ti.u8))
+            **{
+                name: move(getattr(self, name), ti.f32)
+                for name in ("vertices", "colors", "corners")
+            },
+            **{
+                name: move(getattr(self, name), ti.i32)
+                for name in ("faces", "face_texture", "face_object")
+            },
+            textures=move(np.array(rows, np.int32), ti.i32),
+            levels=move(np.array(levels, np.int32), ti.i32),
+            texels=move(np.concatenate(texels), ti.u8),
+        )
 
 
 def mip_levels(texture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
@@ -144,20 +188,31 @@ def mip_levels(texture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
 
 
 def load_scene(path: str | Path) -> TexturedScene:
-    """The scene in a GLB, glTF, OBJ or PLY file, one object a placed mesh; DatasetError where it holds no triangle."""
+    """The scene in a GLB, glTF, OBJ or PLY file, one object a placed mesh; DatasetError where it
+    holds no triangle.
+    """
     try:
         import trimesh
     except ImportError:
-        raise MissingDependency(f"{path}: reading a scene needs trimesh: pip install trimesh") from None
+        raise MissingDependency(
+            f"{path}: reading a scene needs trimesh: pip install trimesh"
+        ) from None
     try:
         scene = trimesh.load(str(path), force="scene", process=False)
-        placed = [(name, *scene.graph[name]) for name in sorted(scene.graph.nodes_geometry)]  # in an order of no chance
-        parts = [(name, T, scene.geometry[key]) for name, T, key in placed if hasattr(scene.geometry[key], "faces")]
+        # in an order of no chance
+        placed = [(name, *scene.graph[name]) for name in sorted(scene.graph.nodes_geometry)]
+        parts = [
+            (name, T, scene.geometry[key])
+            for name, T, key in placed
+            if hasattr(scene.geometry[key], "faces")
+        ]
         return _assemble(path, parts)
     except UniFusionError:
         raise
     except Exception as error:  # a damaged file fails anywhere in its parser
-        raise DatasetError(f"{path}: not a scene that can be read ({type(error).__name__}: {error})") from error
+        raise DatasetError(
+            f"{path}: not a scene that can be read ({type(error).__name__}: {error})"
+        ) from error
 
 
 def _assemble(path: str | Path, parts: Sequence[tuple[str, NDArray, Any]]) -> TexturedScene:
@@ -167,7 +222,9 @@ def _assemble(path: str | Path, parts: Sequence[tuple[str, NDArray, Any]]) -> Te
         raise DatasetError(f"{path}: there are no triangles in it")
     textures: dict[bytes, int] = {}
     images: list[NDArray[np.uint8]] = []
-    arrays: dict[str, list[NDArray]] = {name: [] for name in ("vertices", "colors", "faces", "corners", "face_texture")}
+    arrays: dict[str, list[NDArray]] = {
+        name: [] for name in ("vertices", "colors", "faces", "corners", "face_texture")
+    }
     base = 0
     for _, T_world_mesh, mesh in parts:
         vertices = mesh.vertices @ T_world_mesh[:3, :3].T + T_world_mesh[:3, 3]
@@ -177,7 +234,9 @@ def _assemble(path: str | Path, parts: Sequence[tuple[str, NDArray, Any]]) -> Te
         look = _look_of(mesh)
         texture = -1
         if look.image is not None and look.uv is not None:
-            key = hashlib.sha256(look.image.tobytes()).digest() + bytes(str(look.image.shape), "ascii")
+            key = hashlib.sha256(look.image.tobytes()).digest() + bytes(
+                str(look.image.shape), "ascii"
+            )
             texture = textures.setdefault(key, len(textures))
             if texture == len(images):
                 images.append(look.image)
@@ -188,14 +247,22 @@ def _assemble(path: str | Path, parts: Sequence[tuple[str, NDArray, Any]]) -> Te
         arrays["corners"].append(uv[faces].reshape(-1, 6).astype(np.float32))
         arrays["face_texture"].append(np.full(len(faces), texture, np.int32))
         base += len(vertices)
-    owner = np.repeat(np.arange(len(parts), dtype=np.int32), [len(mesh.faces) for _, _, mesh in parts])
-    return TexturedScene(**{name: np.ascontiguousarray(np.concatenate(list_)) for name, list_ in arrays.items()},
-                         face_object=owner, object_names=tuple(name for name, _, _ in parts), textures=tuple(images))
+    owner = np.repeat(
+        np.arange(len(parts), dtype=np.int32), [len(mesh.faces) for _, _, mesh in parts]
+    )
+    return TexturedScene(
+        **{name: np.ascontiguousarray(np.concatenate(list_)) for name, list_ in arrays.items()},
+        face_object=owner,
+        object_names=tuple(name for name, _, _ in parts),
+        textures=tuple(images),
+    )
 
 
 @dataclass(frozen=True)
 class _Look:
-    """What a mesh looks like: colour factors (V, 3) and, if it has one, a texture with coordinates right and down."""
+    """What a mesh looks like: colour factors (V, 3) and, if it has one, a texture with coordinates
+    right and down.
+    """
 
     colors: NDArray[np.float32]
     image: NDArray[np.uint8] | None = None
@@ -205,7 +272,11 @@ class _Look:
 def _look_of(mesh: Any) -> _Look:
     visual = mesh.visual
     if visual.kind != "texture":
-        colors = np.asarray(visual.vertex_colors)[:, :3] if visual.kind else np.full((len(mesh.vertices), 3), GREY)
+        colors = (
+            np.asarray(visual.vertex_colors)[:, :3]
+            if visual.kind
+            else np.full((len(mesh.vertices), 3), GREY)
+        )
         return _Look(np.ascontiguousarray(colors / 255.0, np.float32))
     material = visual.material
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
@@ -214,5 +285,6 @@ def _look_of(mesh: Any) -> _Look:
         factor = getattr(material, "main_color", None)
     factor = np.full(3, 255) if factor is None else np.asarray(factor)[:3]
     colors = np.tile((factor / 255.0).astype(np.float32), (len(mesh.vertices), 1))
-    uv = None if visual.uv is None else np.asarray(visual.uv, float)[:, :2] * (1, -1) + (0, 1)  # trimesh's v runs up
+    # trimesh's v runs up
+    uv = None if visual.uv is None else np.asarray(visual.uv, float)[:, :2] * (1, -1) + (0, 1)
     return _Look(colors, None if image is None else np.asarray(image.convert("RGB")), uv)

@@ -21,29 +21,30 @@ Mode = Literal["given", "external", "internal", "rgbd"]
 class Verdict(StrEnum):
     """Where a frame's pose comes from, or why there is none."""
 
-    GIVEN = "given"                # as read, not touched
+    GIVEN = "given"  # as read, not touched
     INTERPOLATED = "interpolated"  # between two poses as read
-    TRACKED = "tracked"            # aligned to earlier frames
-    RELOCALISED = "relocalised"    # found by its features at a keyframe, which need not be the last one
-    REFINED = "refined"            # aligned to earlier frames, close to the pose that was given
-    PRIOR_KEPT = "prior kept"      # the pose that was given: the refinement could not be trusted
-    LOST = "lost"                  # no pose: the frame does not fit what was seen before
-    MISSING = "no pose"            # none was given
-    UNREADABLE = "unreadable"      # the frame could not be loaded
+    TRACKED = "tracked"  # aligned to earlier frames
+    # found by its features at a keyframe, which need not be the last one
+    RELOCALISED = "relocalised"
+    REFINED = "refined"  # aligned to earlier frames, close to the pose that was given
+    PRIOR_KEPT = "prior kept"  # the pose that was given: the refinement could not be trusted
+    LOST = "lost"  # no pose: the frame does not fit what was seen before
+    MISSING = "no pose"  # none was given
+    UNREADABLE = "unreadable"  # the frame could not be loaded
 
 
 @dataclass(frozen=True)
 class TrackedFrame:
     """The pose of one frame, how well it fits and what to think of it."""
 
-    index: int                                          # place in its recording
+    index: int  # place in its recording
     verdict: Verdict
-    T_world_camera: NDArray[np.float64] | None = None   # (4, 4); None: the frame must not be mapped
-    timestamp: float | None = None                      # [s]
-    fitness: float | None = None                        # share of its surfels that lie on what it was aligned to
-    rmse: float | None = None                           # of their distances [m]
-    keyframe: int | None = None                         # index of the frame that it was aligned to
-    message: str = ""                                   # why a pose is missing or not trusted
+    T_world_camera: NDArray[np.float64] | None = None  # (4, 4); None: the frame must not be mapped
+    timestamp: float | None = None  # [s]
+    fitness: float | None = None  # share of its surfels that lie on what it was aligned to
+    rmse: float | None = None  # of their distances [m]
+    keyframe: int | None = None  # index of the frame that it was aligned to
+    message: str = ""  # why a pose is missing or not trusted
 
 
 @dataclass(frozen=True)
@@ -51,37 +52,48 @@ class TrackingResult:
     """All frames of a pass, with their final poses."""
 
     frames: tuple[TrackedFrame, ...]
-    keyframes: tuple[int, ...] = ()                # indices in the recording
-    loops: tuple[tuple[int, int], ...] = ()        # pairs of them that closed a loop
+    keyframes: tuple[int, ...] = ()  # indices in the recording
+    loops: tuple[tuple[int, int], ...] = ()  # pairs of them that closed a loop
     details: Mapping[str, Any] = field(default_factory=dict)  # JSON values, for the metrics
     interrupted: bool = False
 
     @property
     def counts(self) -> dict[str, int]:
         """How many frames had which verdict."""
-        return {str(verdict): count for verdict, count in Counter(frame.verdict for frame in self.frames).most_common()}
+        return {
+            str(verdict): count
+            for verdict, count in Counter(frame.verdict for frame in self.frames).most_common()
+        }
 
     @property
     def trajectory(self) -> Trajectory:
-        """Of the frames that have a pose; frame numbers stand in for time stamps where a recording has none."""
+        """Of the frames that have a pose; frame numbers stand in for time stamps where a recording
+        has none.
+        """
         posed = [frame for frame in self.frames if frame.T_world_camera is not None]
         stamps = [frame.timestamp for frame in posed]
         if None in stamps:
             stamps = [frame.index for frame in posed]
-        return Trajectory(np.array(stamps, np.float64), np.array([frame.T_world_camera for frame in posed]).reshape(-1, 4, 4))
+        return Trajectory(
+            np.array(stamps, np.float64),
+            np.array([frame.T_world_camera for frame in posed]).reshape(-1, 4, 4),
+        )
 
 
 class Tracker(ABC):
     """Poses for frames that come in order: `track` each of them, then `finish` once.
 
-    A tracker for another source of poses (a SLAM system, a ROS topic) is one more class like this one.
+    A tracker for another source of poses (a SLAM system, a ROS topic) is one more class like this
+    one.
     """
 
-    uses_given_poses = True   # False: frames are handed over without the poses of their recording
+    uses_given_poses = True  # False: frames are handed over without the poses of their recording
 
     @abstractmethod
     def track(self, frame: Frame) -> TrackedFrame:
-        """The pose as far as it is known now, for display; `finish` may still change it. Never raises for a bad frame."""
+        """The pose as far as it is known now, for display; `finish` may still change it. Never
+        raises for a bad frame.
+        """
 
     def skip(self, index: int, error: Exception) -> TrackedFrame:
         """Note a frame that could not be loaded."""
@@ -98,7 +110,9 @@ class TrackingSettings:
     """How poses are found and refined."""
 
     photometric_weight: float = 0.1
-    """Weight of colour against geometry when frames are aligned; it decides what geometry leaves open. 0: geometry alone."""
+    """Weight of colour against geometry when frames are aligned; it decides what geometry leaves
+    open. 0: geometry alone.
+    """
     depth_max: float = 6.0
     """Farthest reading that tracking uses, in metres."""
     keyframe_distance: float = 0.10
@@ -112,7 +126,9 @@ class TrackingSettings:
     loops: bool = True
     """Recognise places seen before, and distribute what was drifted over the trajectory."""
     prior_distance: float = 0.10
-    """internal: a refinement that moves a pose further than this from the given one, in metres, is not trusted ..."""
+    """internal: a refinement that moves a pose further than this from the given one, in metres, is
+    not trusted ...
+    """
     prior_angle: float = 5.0
     """... nor one that turns it by more than this, in degrees."""
 
@@ -123,6 +139,12 @@ class TrackingSettings:
         for name in positive:
             if not getattr(self, name) > 0:
                 raise InputError(f"tracking: {name} must be positive, got {getattr(self, name)}")
-        if not 0 <= self.photometric_weight <= 100 or not 0 < self.keyframe_fitness < 1 or self.window < 1:
-            raise InputError(f"tracking: need photometric_weight in 0..100, keyframe_fitness in (0, 1) and window >= 1, got "
-                             f"{self.photometric_weight}, {self.keyframe_fitness} and {self.window}")
+        if (
+            not 0 <= self.photometric_weight <= 100
+            or not 0 < self.keyframe_fitness < 1
+            or self.window < 1
+        ):
+            raise InputError(
+                f"tracking: need photometric_weight in 0..100, keyframe_fitness in (0, 1) and window >= 1, got "
+                f"{self.photometric_weight}, {self.keyframe_fitness} and {self.window}"
+            )

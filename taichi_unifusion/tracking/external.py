@@ -1,4 +1,6 @@
-"""Poses from a trajectory file of any SLAM system, joined to the frames by time stamp or number (Sec. V-A.1)."""
+"""Poses from a trajectory file of any SLAM system, joined to the frames by time stamp or number
+(Sec. V-A.1).
+"""
 
 from __future__ import annotations
 
@@ -9,16 +11,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.time_stamps import check_max_difference, nearest
 from ..errors import DatasetError
-from ..types import Frame
 from ..geometry import se3
+from ..geometry.time_stamps import check_max_difference, nearest
+from ..types import Frame
 from .base import TrackedFrame, Tracker, TrackingResult, Verdict
 from .trajectory_files import ExternalPoses
 
-MAX_DIFFERENCE = 0.02       # [s] between a frame and its pose, as TUM's benchmark has it
-NUMBERED = r"[A-Za-z_-]*(\d+)(?:\.(?:color|depth))?\.[A-Za-z]+"  # names of images with the frame's number
-LONGEST_GAP = 1.0, 30.0     # [s] or frames; a longer gap is not interpolated: nobody knows what the camera did in it
+MAX_DIFFERENCE = 0.02  # [s] between a frame and its pose, as TUM's benchmark has it
+# names of images with the frame's number
+NUMBERED = r"[A-Za-z_-]*(\d+)(?:\.(?:color|depth))?\.[A-Za-z]+"
+# [s] or frames; a longer gap is not interpolated: nobody knows what the camera did in it
+LONGEST_GAP = 1.0, 30.0
 
 
 class ExternalPoseTracker(Tracker):
@@ -26,7 +30,12 @@ class ExternalPoseTracker(Tracker):
 
     uses_given_poses = False
 
-    def __init__(self, poses: ExternalPoses, interpolate: bool = False, max_difference: float = MAX_DIFFERENCE) -> None:
+    def __init__(
+        self,
+        poses: ExternalPoses,
+        interpolate: bool = False,
+        max_difference: float = MAX_DIFFERENCE,
+    ) -> None:
         check_max_difference(max_difference)
         self.poses, self.interpolate, self.max_difference = poses, interpolate, max_difference
         self.frames: list[TrackedFrame] = []
@@ -34,7 +43,9 @@ class ExternalPoseTracker(Tracker):
 
     def track(self, frame: Frame) -> TrackedFrame:
         verdict, pose, message = self.pose_of(frame)
-        self.frames.append(TrackedFrame(frame.index, verdict, pose, frame.timestamp, message=message))
+        self.frames.append(
+            TrackedFrame(frame.index, verdict, pose, frame.timestamp, message=message)
+        )
         return self.frames[-1]
 
     def pose_of(self, frame: Frame) -> tuple[Verdict, NDArray[np.float64] | None, str]:
@@ -52,18 +63,27 @@ class ExternalPoseTracker(Tracker):
             between = poses.T_world_camera[after - 1], poses.T_world_camera[after]
             share = (key - poses.keys[after - 1]) / (poses.keys[after] - poses.keys[after - 1])
             return Verdict.INTERPOLATED, interpolate(*between, share), ""
-        return Verdict.MISSING, None, f"{poses.source}: the nearest pose is {gap:g} {unit.rstrip('s') if gap == 1 and unit != 's' else unit} away"
+        return (
+            Verdict.MISSING,
+            None,
+            f"{poses.source}: the nearest pose is {gap:g} {unit.rstrip('s') if gap == 1 and unit != 's' else unit} away",
+        )
 
     def _key(self, frame: Frame) -> tuple[float, str, float, float]:
-        """What to look for: number or time stamp, its unit, how far off it may be, the longest gap to interpolate."""
+        """What to look for: number or time stamp, its unit, how far off it may be, the longest gap
+        to interpolate.
+        """
         if not self.poses.by_time:
             return float(self._number(frame)), "frames", 0.0, LONGEST_GAP[1]
-        if frame.timestamp is None:  # frame numbers stand in for time stamps, as in a trajectory.txt of ours
+        # frame numbers stand in for time stamps, as in a trajectory.txt of ours
+        if frame.timestamp is None:
             return float(frame.index), "frames", 1e-6, LONGEST_GAP[1]
         return frame.timestamp, "s", self.max_difference, LONGEST_GAP[0]
 
     def _number(self, frame: Frame) -> int:
-        """A frame's number as the poses have it: in the name of its image, or its place in the recording."""
+        """A frame's number as the poses have it: in the name of its image, or its place in the
+        recording.
+        """
         named = self.poses.by_name and re.fullmatch(NUMBERED, Path(frame.name).name)
         return int(named[1]) if named else frame.index
 
@@ -73,11 +93,15 @@ class ExternalPoseTracker(Tracker):
 
     def finish(self) -> TrackingResult:
         if not any(frame.T_world_camera is not None for frame in self.frames) and self.frames:
-            raise DatasetError(f"{self.poses.source}: none of its {len(self.poses.keys)} poses belongs to a frame; its "
-                               f"{'time stamps' if self.poses.by_time else 'frame numbers'} run from {self.poses.keys[0]:g} to "
-                               f"{self.poses.keys[-1]:g}, those of the frames from {min(self.keys, default=0):g} to "
-                               f"{max(self.keys, default=0):g}")
-        return TrackingResult(tuple(self.frames), details={"trajectory": self.poses.source, "gaps": gaps(self.frames)})
+            raise DatasetError(
+                f"{self.poses.source}: none of its {len(self.poses.keys)} poses belongs to a frame; its "
+                f"{'time stamps' if self.poses.by_time else 'frame numbers'} run from {self.poses.keys[0]:g} to "
+                f"{self.poses.keys[-1]:g}, those of the frames from {min(self.keys, default=0):g} to "
+                f"{max(self.keys, default=0):g}"
+            )
+        return TrackingResult(
+            tuple(self.frames), details={"trajectory": self.poses.source, "gaps": gaps(self.frames)}
+        )
 
 
 def interpolate(T_a: NDArray, T_b: NDArray, share: float) -> NDArray[np.float64]:

@@ -1,4 +1,6 @@
-"""ORB features with depth: recognises a place seen before and says roughly where the camera is in it."""
+"""ORB features with depth: recognises a place seen before and says roughly where the camera is in
+it.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +14,25 @@ from numpy.typing import NDArray
 from ..types import Frame
 
 FEATURES = 800
-LEAST_WIDTH = 320      # [px] smaller images are enlarged: a corner's surroundings are 31 pixels wide
-RATIO = 0.8            # best against second-best distance of a match
-REPROJECTION = 6.0     # [px] of a match that supports a pose
-MIN_MATCHES = 12       # that support a pose
+LEAST_WIDTH = 320  # [px] smaller images are enlarged: a corner's surroundings are 31 pixels wide
+RATIO = 0.8  # best against second-best distance of a match
+REPROJECTION = 6.0  # [px] of a match that supports a pose
+MIN_MATCHES = 12  # that support a pose
 RANSAC_ITERATIONS = 300
-QUERY_FEATURES, STORED_FEATURES = 200, 300  # of the strongest, that vote for similar keyframes, and that are voted for
+# of the strongest, that vote for similar keyframes, and that are voted for
+QUERY_FEATURES, STORED_FEATURES = 200, 300
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Corners of a frame that have a depth, strongest first; pixels are those of the image that they were found in."""
+    """Corners of a frame that have a depth, strongest first; pixels are those of the image that
+    they were found in.
+    """
 
     descriptors: NDArray[np.uint8]  # (N, 32)
-    pixels: NDArray[np.float32]     # (N, 2) u, v
-    points: NDArray[np.float32]     # (N, 3) camera [m]
-    K: NDArray[np.float64]          # (3, 3)
+    pixels: NDArray[np.float32]  # (N, 2) u, v
+    points: NDArray[np.float32]  # (N, 3) camera [m]
+    K: NDArray[np.float64]  # (3, 3)
 
     def __len__(self) -> int:
         return len(self.descriptors)
@@ -39,7 +44,9 @@ def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Featur
     scale = -(-LEAST_WIDTH // camera.width)
     cx, cy = scale * (camera.cx + 0.5) - 0.5, scale * (camera.cy + 0.5) - 0.5
     K = np.array([[scale * camera.fx, 0, cx], [0, scale * camera.fy, cy], [0, 0, 1]])
-    empty = Features(np.empty((0, 32), np.uint8), np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), K)
+    empty = Features(
+        np.empty((0, 32), np.uint8), np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), K
+    )
     if frame.color is None:
         return empty
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
@@ -49,7 +56,11 @@ def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Featur
     if not corners:
         return empty
     pixels = np.array([corner.pt for corner in corners], np.float32)
-    at = np.rint((pixels + 0.5) / scale - 0.5).astype(int).clip(0, (camera.width - 1, camera.height - 1))
+    at = (
+        np.rint((pixels + 0.5) / scale - 0.5)
+        .astype(int)
+        .clip(0, (camera.width - 1, camera.height - 1))
+    )
     z = frame.depth[at[:, 1], at[:, 0]]
     with np.errstate(invalid="ignore"):
         seen = np.isfinite(z) & (z >= depth_min) & (z <= depth_max)
@@ -61,7 +72,9 @@ def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Featur
 
 
 def most_similar(query: Features, others: Sequence[Features], count: int) -> list[int]:
-    """Numbers of the `count` of `others` that most of the query's strongest features find their nearest neighbour in."""
+    """Numbers of the `count` of `others` that most of the query's strongest features find their
+    nearest neighbour in.
+    """
     sizes = [min(len(other), STORED_FEATURES) for other in others]
     if not len(query) or not sum(sizes):
         return []
@@ -74,19 +87,29 @@ def most_similar(query: Features, others: Sequence[Features], count: int) -> lis
 
 
 def locate(query: Features, other: Features) -> NDArray[np.float64] | None:
-    """T_other_query from matched features by perspective-n-point RANSAC, or None where too few of them agree."""
+    """T_other_query from matched features by perspective-n-point RANSAC, or None where too few of
+    them agree.
+    """
     if min(len(query), len(other)) < MIN_MATCHES:
         return None
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(query.descriptors, other.descriptors, k=2)
-    good = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
+    good = [
+        pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance
+    ]
     if len(good) < MIN_MATCHES:
         return None
     points = np.array([other.points[match.trainIdx] for match in good], np.float64)
     pixels = np.array([query.pixels[match.queryIdx] for match in good], np.float64)
     cv2.setRNGSeed(0)  # the same frames give the same pose
     found, rotation, translation, inliers = cv2.solvePnPRansac(
-        points, pixels, query.K, None, iterationsCount=RANSAC_ITERATIONS, reprojectionError=REPROJECTION,
-        flags=cv2.SOLVEPNP_AP3P)
+        points,
+        pixels,
+        query.K,
+        None,
+        iterationsCount=RANSAC_ITERATIONS,
+        reprojectionError=REPROJECTION,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
     if not found or inliers is None or len(inliers) < MIN_MATCHES:
         return None
     T_query_other = np.eye(4)

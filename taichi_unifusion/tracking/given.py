@@ -14,9 +14,17 @@ class GivenPoses(Tracker):
 
     def track(self, frame: Frame) -> TrackedFrame:
         if frame.T_world_camera is None:
-            tracked = TrackedFrame(frame.index, Verdict.MISSING, None, frame.timestamp, message="the recording has none")
+            tracked = TrackedFrame(
+                frame.index,
+                Verdict.MISSING,
+                None,
+                frame.timestamp,
+                message="the recording has none",
+            )
         else:
-            tracked = TrackedFrame(frame.index, Verdict.GIVEN, frame.T_world_camera, frame.timestamp)
+            tracked = TrackedFrame(
+                frame.index, Verdict.GIVEN, frame.T_world_camera, frame.timestamp
+            )
         self.frames.append(tracked)
         return tracked
 

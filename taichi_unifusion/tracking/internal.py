@@ -1,32 +1,40 @@
-"""Internal tracking: poses that are given, refined by colored ICP against recent keyframes (Sec. V-A.1)."""
+"""Internal tracking: poses that are given, refined by colored ICP against recent keyframes (Sec.
+V-A.1).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from ..geometry import se3
 from .base import TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
 from .odometry import KeyframeOdometry, View
 from .pose_graph import Edge, Prior
 from .registration import Registration
 
-WINDOW = 3                                                    # keyframes, at least
-PRIOR_SIGMA = np.array([0.02] * 3 + [np.radians(1.0)] * 3)    # [m, rad] of a given pose
-GIVEN_SIGMA = np.array([0.01] * 3 + [np.radians(0.5)] * 3)    # of the motion between two given poses that are near
+WINDOW = 3  # keyframes, at least
+PRIOR_SIGMA = np.array([0.02] * 3 + [np.radians(1.0)] * 3)  # [m, rad] of a given pose
+# of the motion between two given poses that are near
+GIVEN_SIGMA = np.array([0.01] * 3 + [np.radians(0.5)] * 3)
 
 
 class InternalTracker(Tracker):
-    """Refines the poses of another tracker; one that cannot be trusted stays as it was, relative to its keyframe.
+    """Refines the poses of another tracker; one that cannot be trusted stays as it was, relative to
+    its keyframe.
 
-    Keyframes are held near their given poses while they are aligned to each other, so that a globally consistent trajectory
-    stays so.
+    Keyframes are held near their given poses while they are aligned to each other, so that a
+    globally consistent trajectory stays so.
     """
 
-    def __init__(self, prior: Tracker, settings: TrackingSettings | None = None,
-                 preprocess: PreprocessSettings | None = None) -> None:
+    def __init__(
+        self,
+        prior: Tracker,
+        settings: TrackingSettings | None = None,
+        preprocess: PreprocessSettings | None = None,
+    ) -> None:
         self.prior, self.settings = prior, settings or TrackingSettings()
         self.uses_given_poses = prior.uses_given_poses
         self.odometry = KeyframeOdometry(self.settings, preprocess or PreprocessSettings())
@@ -46,12 +54,20 @@ class InternalTracker(Tracker):
             return odometry.place(view, Verdict.PRIOR_KEPT, T_reference_prior, None, view.blank)
         found, problem = odometry.align(view, guess, max(WINDOW, self.settings.window))
         problem = problem or self._too_far(found, T_reference_prior)
-        if problem and se3.distance(np.eye(4), T_reference_prior)[0] > 2 * self.settings.keyframe_distance:
-            return self._start(view, given, problem)  # a gap: what comes next is aligned to this frame
+        if (
+            problem
+            and se3.distance(np.eye(4), T_reference_prior)[0] > 2 * self.settings.keyframe_distance
+        ):
+            # a gap: what comes next is aligned to this frame
+            return self._start(view, given, problem)
         pose = T_reference_prior if problem else found.T_target_source
-        tracked = odometry.place(view, Verdict.PRIOR_KEPT if problem else Verdict.REFINED, pose, found, problem)
+        tracked = odometry.place(
+            view, Verdict.PRIOR_KEPT if problem else Verdict.REFINED, pose, found, problem
+        )
         if not problem and odometry.is_far(found):
-            self._add_keyframe(view, given, odometry.keyframes.T_world_keyframe[reference] @ pose, found)
+            self._add_keyframe(
+                view, given, odometry.keyframes.T_world_keyframe[reference] @ pose, found
+            )
         return tracked
 
     def skip(self, index: int, error: Exception) -> TrackedFrame:
@@ -69,11 +85,17 @@ class InternalTracker(Tracker):
         return ""
 
     def _start(self, view: View, given: TrackedFrame, problem: str) -> TrackedFrame:
-        """A keyframe that is where it was given, because of a problem or as the first; the next ones are aligned to it."""
+        """A keyframe that is where it was given, because of a problem or as the first; the next
+        ones are aligned to it.
+        """
         self._add_keyframe(view, given, given.T_world_camera, None)
-        return self.odometry.place(view, Verdict.PRIOR_KEPT if problem else given.verdict, np.eye(4), None, problem)
+        return self.odometry.place(
+            view, Verdict.PRIOR_KEPT if problem else given.verdict, np.eye(4), None, problem
+        )
 
-    def _add_keyframe(self, view: View, given: TrackedFrame, T_world_camera: NDArray, found: Registration | None) -> None:
+    def _add_keyframe(
+        self, view: View, given: TrackedFrame, T_world_camera: NDArray, found: Registration | None
+    ) -> None:
         odometry, before = self.odometry, self.odometry.reference
         number = odometry.add_keyframe(view, se3.normalized(T_world_camera), found)
         self.T_world_prior.append(given.T_world_camera)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from .features import Features
 from .pyramid import ReducedFrame, SurfelPyramid, build_pyramid
 
-GRID = 16           # [px] between points that stand for a keyframe where the overlap of two is estimated
-SAME_DEPTH = 0.1    # share of the depth by which a point and a reading may differ
+GRID = 16  # [px] between points that stand for a keyframe where the overlap of two is estimated
+SAME_DEPTH = 0.1  # share of the depth by which a point and a reading may differ
 LIVE_PYRAMIDS = 24  # 3 MB each; older ones are built again from their images when needed
 
 
@@ -21,7 +21,7 @@ LIVE_PYRAMIDS = 24  # 3 MB each; older ones are built again from their images wh
 class Keyframe:
     """A frame that others are aligned to."""
 
-    index: int                    # place in its recording
+    index: int  # place in its recording
     reduced: ReducedFrame
     features: Features
 
@@ -29,9 +29,11 @@ class Keyframe:
     def points(self) -> NDArray[np.float64]:
         """(N, 3) points on a coarse grid of its pixels, in its camera [m]."""
         camera, inverse = self.reduced.camera, self.reduced.inverse
-        v, u = np.mgrid[GRID // 2:camera.height:GRID, GRID // 2:camera.width:GRID]
+        v, u = np.mgrid[GRID // 2 : camera.height : GRID, GRID // 2 : camera.width : GRID]
         q = inverse[v, u]
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+        rays = np.stack(
+            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
+        )
         return (rays / np.where(q > 0, q, 1)[..., None])[q > 0].astype(np.float64)
 
     def overlap(self, other: Keyframe, T_other_self: NDArray) -> float:
@@ -41,14 +43,19 @@ class Keyframe:
         x, y, z = T_other_self[:3, :3] @ self.points.T + T_other_self[:3, 3:]
         camera, front = other.reduced.camera, z > 0.05
         depth = np.where(front, z, 1.0)
-        u, v = np.rint(camera.fx * x / depth + camera.cx), np.rint(camera.fy * y / depth + camera.cy)
+        u, v = (
+            np.rint(camera.fx * x / depth + camera.cx),
+            np.rint(camera.fy * y / depth + camera.cy),
+        )
         seen = front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
         q = other.reduced.inverse[v[seen].astype(int), u[seen].astype(int)]
         return float((np.abs(z[seen] * q - 1) < SAME_DEPTH).sum() / len(self.points))
 
 
 class Keyframes:
-    """Keyframes by number, in order, with their poses as known now; builds pyramids when they are asked for."""
+    """Keyframes by number, in order, with their poses as known now; builds pyramids when they are
+    asked for.
+    """
 
     def __init__(self) -> None:
         self.items: list[Keyframe] = []

@@ -11,31 +11,45 @@ from .keyframes import Keyframes
 from .pose_graph import Edge
 from .registration import Registration, register
 
-NEAR = 6             # keyframes that are neighbours in time
-NEIGHBORS = 2        # of them, so many are aligned beside the one before
-LOOPS = 2            # older keyframes that are aligned at most, by place and by appearance each
-MIN_OVERLAP = 0.3    # of a pair that is worth aligning
-LOOP_OVERLAP, LOOP_AGREEMENT = 0.25, 0.75  # of a pair that is believed; stricter than from frame to frame
-LOOP_UNCERTAINTY = 0.02                    # [m] of its translation in the weakest direction
-MAX_CORRECTION = 0.3, np.radians(15)       # [m, rad] by which alignment may move what features found
+NEAR = 6  # keyframes that are neighbours in time
+NEIGHBORS = 2  # of them, so many are aligned beside the one before
+LOOPS = 2  # older keyframes that are aligned at most, by place and by appearance each
+MIN_OVERLAP = 0.3  # of a pair that is worth aligning
+# of a pair that is believed; stricter than from frame to frame
+LOOP_OVERLAP, LOOP_AGREEMENT = 0.25, 0.75
+LOOP_UNCERTAINTY = 0.02  # [m] of its translation in the weakest direction
+MAX_CORRECTION = 0.3, np.radians(15)  # [m, rad] by which alignment may move what features found
 
 
 def neighbor_edges(keyframes: Keyframes, number: int, photometric_weight: float) -> list[Edge]:
     """A keyframe aligned to recent ones beside the one before it."""
     recent = _by_overlap(keyframes, number, range(max(0, number - NEAR), number - 1))
-    return [edge for other in recent[:NEIGHBORS] if (edge := _edge(keyframes, other, number, photometric_weight, None))]
+    return [
+        edge
+        for other in recent[:NEIGHBORS]
+        if (edge := _edge(keyframes, other, number, photometric_weight, None))
+    ]
 
 
-def find_loops(keyframes: Keyframes, number: int, photometric_weight: float, by_appearance: bool) -> list[Edge]:
-    """A keyframe aligned to older ones: to those that it should see if its pose is right, and to those that look like it."""
+def find_loops(
+    keyframes: Keyframes, number: int, photometric_weight: float, by_appearance: bool
+) -> list[Edge]:
+    """A keyframe aligned to older ones: to those that it should see if its pose is right, and to
+    those that look like it.
+    """
     older = range(max(0, number - NEAR))
-    edges = [edge for other in _by_overlap(keyframes, number, older)[:LOOPS]
-             if (edge := _edge(keyframes, other, number, photometric_weight, None, loop=True))]
+    edges = [
+        edge
+        for other in _by_overlap(keyframes, number, older)[:LOOPS]
+        if (edge := _edge(keyframes, other, number, photometric_weight, None, loop=True))
+    ]
     if by_appearance and not edges:
         features = keyframes.items[number].features
         for other in most_similar(features, [keyframes.items[k].features for k in older], LOOPS):
             guess = locate(features, keyframes.items[other].features)
-            if guess is not None and (edge := _edge(keyframes, other, number, photometric_weight, guess, loop=True)):
+            if guess is not None and (
+                edge := _edge(keyframes, other, number, photometric_weight, guess, loop=True)
+            ):
                 edges.append(edge)
     return edges
 
@@ -44,25 +58,42 @@ def _by_overlap(keyframes: Keyframes, number: int, others: range) -> list[int]:
     """Those of `others` that should see what the keyframe sees, most of it first."""
     found = []
     for other in others:
-        T_other_number = se3.inverse(keyframes.T_world_keyframe[other]) @ keyframes.T_world_keyframe[number]
+        T_other_number = (
+            se3.inverse(keyframes.T_world_keyframe[other]) @ keyframes.T_world_keyframe[number]
+        )
         overlap = keyframes.items[number].overlap(keyframes.items[other], T_other_number)
         if overlap > MIN_OVERLAP:
             found.append((-overlap, other))
     return [other for _, other in sorted(found)]
 
 
-def _edge(keyframes: Keyframes, other: int, number: int, photometric_weight: float, guess: NDArray | None,
-          loop: bool = False) -> Edge | None:
-    """Keyframe `number` aligned to `other`, or None where that is not to be believed; `guess` is T_other_number."""
+def _edge(
+    keyframes: Keyframes,
+    other: int,
+    number: int,
+    photometric_weight: float,
+    guess: NDArray | None,
+    loop: bool = False,
+) -> Edge | None:
+    """Keyframe `number` aligned to `other`, or None where that is not to be believed; `guess` is
+    T_other_number.
+    """
     if guess is None:
         guess = se3.inverse(keyframes.T_world_keyframe[other]) @ keyframes.T_world_keyframe[number]
     found = register(keyframes.pyramid(number), keyframes.pyramid(other), guess, photometric_weight)
-    return Edge.of(other, number, found, robust=True, loop=loop) if believable(found, guess) else None
+    return (
+        Edge.of(other, number, found, robust=True, loop=loop) if believable(found, guess) else None
+    )
 
 
 def believable(found: Registration, guess: NDArray) -> bool:
     """Whether two keyframes really see the same from there."""
     distance, angle = se3.distance(guess, found.T_target_source)
-    return (found.overlap > LOOP_OVERLAP and found.agreement > LOOP_AGREEMENT
-            and found.determined and found.uncertainty[-1] < LOOP_UNCERTAINTY
-            and distance < MAX_CORRECTION[0] and angle < MAX_CORRECTION[1])
+    return (
+        found.overlap > LOOP_OVERLAP
+        and found.agreement > LOOP_AGREEMENT
+        and found.determined
+        and found.uncertainty[-1] < LOOP_UNCERTAINTY
+        and distance < MAX_CORRECTION[0]
+        and angle < MAX_CORRECTION[1]
+    )

@@ -1,7 +1,8 @@
-"""Pose graph: Gauss-Newton on SE(3) with robust loop edges (Grisetti et al. 2010; Yang et al. 2020).
+"""Pose graph: Gauss-Newton on SE(3) with robust loop edges (Grisetti et al. 2010; Yang et al.
+2020).
 
-A few sparse matrices, no library beside SciPy: a map needs nothing but the base installation. Open3D's optimiser is the test's
-oracle.
+A few sparse matrices, no library beside SciPy: a map needs nothing but the base installation.
+Open3D's optimiser is the test's oracle.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ from ..geometry import se3
 from .registration import Registration
 
 ITERATIONS = 60
-CONVERGED = 1e-6      # [m, rad] largest change of a pose
-LOOP_SCALE = 100.0    # squared Mahalanobis distance at which a loop edge counts a quarter
-ANNEALING = 2.0       # by which that scale shrinks from step to step, from the largest distance on
-ANCHOR = 1e12         # information that holds the first pose
+CONVERGED = 1e-6  # [m, rad] largest change of a pose
+LOOP_SCALE = 100.0  # squared Mahalanobis distance at which a loop edge counts a quarter
+ANNEALING = 2.0  # by which that scale shrinks from step to step, from the largest distance on
+ANCHOR = 1e12  # information that holds the first pose
 CONTRADICTION = 20.0  # squared Mahalanobis distance that one in 400 right edges exceeds
-FLOOR = np.array([0.003] * 3 + [np.radians(0.15)] * 3)  # [m, rad] that calibration leaves of every alignment
-BLIND = 1e-6          # information that a direction has at least, so that its inverse exists
+# [m, rad] that calibration leaves of every alignment
+FLOOR = np.array([0.003] * 3 + [np.radians(0.15)] * 3)
+BLIND = 1e-6  # information that a direction has at least, so that its inverse exists
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,20 +33,32 @@ class Edge:
 
     a: int
     b: int
-    T_a_b: NDArray[np.float64]        # (4, 4)
+    T_a_b: NDArray[np.float64]  # (4, 4)
     information: NDArray[np.float64]  # (6, 6) of a twist on the right of T_a_b
-    robust: bool = False              # may be wrong altogether
-    loop: bool = False                # joins keyframes that are not neighbours in time
+    robust: bool = False  # may be wrong altogether
+    loop: bool = False  # joins keyframes that are not neighbours in time
 
     @classmethod
-    def of(cls, a: int, b: int, found: Registration, *, robust: bool = False, loop: bool = False) -> Edge:
+    def of(
+        cls, a: int, b: int, found: Registration, *, robust: bool = False, loop: bool = False
+    ) -> Edge:
         """Node b aligned to node a."""
-        on_right = se3.adjoint(found.T_target_source)  # the registration's information is of a twist on the left
-        return cls(a, b, found.T_target_source, with_floor(on_right.T @ found.information @ on_right), robust, loop)
+        # the registration's information is of a twist on the left
+        on_right = se3.adjoint(found.T_target_source)
+        return cls(
+            a,
+            b,
+            found.T_target_source,
+            with_floor(on_right.T @ found.information @ on_right),
+            robust,
+            loop,
+        )
 
     def contradicts(self, T_world_node: Sequence[NDArray]) -> bool:
         """Whether the poses as they are now do not fit this edge."""
-        e = se3.log(se3.inverse(self.T_a_b) @ se3.inverse(T_world_node[self.a]) @ T_world_node[self.b])
+        e = se3.log(
+            se3.inverse(self.T_a_b) @ se3.inverse(T_world_node[self.a]) @ T_world_node[self.b]
+        )
         return bool(e @ self.information @ e > CONTRADICTION)
 
 
@@ -62,15 +76,17 @@ class OptimizedGraph:
     """Poses of all nodes, and how far the loop edges were trusted."""
 
     T_world_node: NDArray[np.float64]  # (N, 4, 4)
-    weights: NDArray[np.float64]       # (E,) 1 for edges that are not robust
+    weights: NDArray[np.float64]  # (E,) 1 for edges that are not robust
     iterations: int
 
 
-def optimize(T_world_node: Sequence[NDArray], edges: Sequence[Edge], priors: Sequence[Prior] = ()) -> OptimizedGraph:
+def optimize(
+    T_world_node: Sequence[NDArray], edges: Sequence[Edge], priors: Sequence[Prior] = ()
+) -> OptimizedGraph:
     """Poses that fit all edges and priors; without priors the first pose stays as it is.
 
-    Robust edges have Geman-McClure's weight, whose scale shrinks from where it trusts all of them: drift is pulled in before an
-    edge that contradicts the others loses its say.
+    Robust edges have Geman-McClure's weight, whose scale shrinks from where it trusts all of them:
+    drift is pulled in before an edge that contradicts the others loses its say.
     """
     T = np.array(T_world_node, np.float64).reshape(-1, 4, 4)
     stacked = _stack(edges)
@@ -93,25 +109,31 @@ class _Edges:
 
     a: NDArray[np.int64]
     b: NDArray[np.int64]
-    T_a_b: NDArray[np.float64]        # (E, 4, 4)
+    T_a_b: NDArray[np.float64]  # (E, 4, 4)
     information: NDArray[np.float64]  # (E, 6, 6)
     robust: NDArray[np.bool_]
 
 
 def _stack(edges: Sequence[Edge]) -> _Edges:
-    return _Edges(np.array([edge.a for edge in edges], int), np.array([edge.b for edge in edges], int),
-                  np.array([edge.T_a_b for edge in edges], np.float64).reshape(-1, 4, 4),
-                  np.array([edge.information for edge in edges], np.float64).reshape(-1, 6, 6),
-                  np.array([edge.robust for edge in edges], bool))
+    return _Edges(
+        np.array([edge.a for edge in edges], int),
+        np.array([edge.b for edge in edges], int),
+        np.array([edge.T_a_b for edge in edges], np.float64).reshape(-1, 4, 4),
+        np.array([edge.information for edge in edges], np.float64).reshape(-1, 6, 6),
+        np.array([edge.robust for edge in edges], bool),
+    )
 
 
-def _solve(T: NDArray, edges: _Edges, residuals: NDArray, weights: NDArray, priors: Sequence[Prior]) -> NDArray[np.float64]:
+def _solve(
+    T: NDArray, edges: _Edges, residuals: NDArray, weights: NDArray, priors: Sequence[Prior]
+) -> NDArray[np.float64]:
     """One step: (N, 6) twists on the right of the poses."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
 
     information = weights[:, None, None] * edges.information
-    J = -se3.adjoint(se3.inverse(T[edges.b]) @ T[edges.a])  # of the residual by a's twist; by b's it is the identity
+    # of the residual by a's twist; by b's it is the identity
+    J = -se3.adjoint(se3.inverse(T[edges.b]) @ T[edges.a])
     J_information = J.swapaxes(1, 2) @ information
     b = np.zeros((len(T), 6))
     np.add.at(b, edges.a, (J_information @ residuals[:, :, None])[..., 0])
@@ -121,11 +143,15 @@ def _solve(T: NDArray, edges: _Edges, residuals: NDArray, weights: NDArray, prio
     if priors:
         off = se3.log(se3.inverse(np.array([prior.T_world_node for prior in priors])) @ T[nodes])
         np.add.at(b, nodes, (anchors @ off[:, :, None])[..., 0])
-    values = np.concatenate([J_information @ J, J_information, information @ J, information, anchors])
+    values = np.concatenate(
+        [J_information @ J, J_information, information @ J, information, anchors]
+    )
     rows = np.concatenate([edges.a, edges.a, edges.b, edges.b, nodes])[:, None, None]
     columns = np.concatenate([edges.a, edges.b, edges.a, edges.b, nodes])[:, None, None]
-    at = [np.broadcast_to(6 * rows + np.arange(6)[:, None], values.shape).ravel(),
-          np.broadcast_to(6 * columns + np.arange(6), values.shape).ravel()]
+    at = [
+        np.broadcast_to(6 * rows + np.arange(6)[:, None], values.shape).ravel(),
+        np.broadcast_to(6 * columns + np.arange(6), values.shape).ravel(),
+    ]
     H = coo_matrix((values.ravel(), tuple(at)), shape=(6 * len(T), 6 * len(T))).tocsc()
     return -spsolve(H, b.ravel()).reshape(-1, 6)
 

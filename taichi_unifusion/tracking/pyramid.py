@@ -11,27 +11,29 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..types import Frame, PinholeCamera
 
-FINEST_WIDTH = 320         # [px] at least; finer images add time and noise, no accuracy
-SMALLEST = 24              # [px] shorter side of the coarsest level
+FINEST_WIDTH = 320  # [px] at least; finer images add time and noise, no accuracy
+SMALLEST = 24  # [px] shorter side of the coarsest level
 NORMAL_RADIUS = (3, 2, 2)  # [px] by level, finest first
-EDGE_JUMP = 0.03           # of the depth between pixels of one surface, in an image of FINEST_WIDTH or more
-EDGE_SUPPORT = 5           # as in preprocessing
-MAX_ANGLE = 80.0           # [degrees] between ray and normal
+EDGE_JUMP = 0.03  # of the depth between pixels of one surface, in an image of FINEST_WIDTH or more
+EDGE_SUPPORT = 5  # as in preprocessing
+MAX_ANGLE = 80.0  # [degrees] between ray and normal
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedFrame:
     """What of a frame is enough to build its pyramid again: the finest level's images."""
 
-    inverse: NDArray[np.float32]    # (h, w) [1/m], 0: none
+    inverse: NDArray[np.float32]  # (h, w) [1/m], 0: none
     intensity: NDArray[np.float16]  # (h, w) in [0, 1]; zero where the frame has no colour
-    camera: PinholeCamera           # of these pixels
-    colored: bool                   # False: intensity says nothing
+    camera: PinholeCamera  # of these pixels
+    colored: bool  # False: intensity says nothing
 
 
 @dataclass(frozen=True, eq=False)
 class SurfelImage:
-    """One level: an (h, w, 8) image of surfels on the device (kernels/registration.py), and the camera of its pixels."""
+    """One level: an (h, w, 8) image of surfels on the device (kernels/registration.py), and the
+    camera of its pixels.
+    """
 
     surfels: Any
     camera: PinholeCamera
@@ -72,7 +74,11 @@ def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
     from ..kernels import images
     from ..kernels import registration as kernels
 
-    inverse, intensity, camera = reduced.inverse, reduced.intensity.astype(np.float32), reduced.camera
+    inverse, intensity, camera = (
+        reduced.inverse,
+        reduced.intensity.astype(np.float32),
+        reduced.camera,
+    )
     cosine = float(np.cos(np.radians(MAX_ANGLE)))
     levels = []
     for level, radius in enumerate(NORMAL_RADIUS):
@@ -81,11 +87,23 @@ def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
                 break
             camera = shrunk(camera, 2)
             finer, finer_intensity = inverse, intensity
-            inverse, intensity = (np.empty((camera.height, camera.width), np.float32) for _ in range(2))
+            inverse, intensity = (
+                np.empty((camera.height, camera.width), np.float32) for _ in range(2)
+            )
             kernels.average_inverse_depth(finer, 2, edge_jump(camera), inverse)
             kernels.average_intensity(finer_intensity, intensity)
         normals = np.empty((*inverse.shape, 3), np.float32)
-        images.estimate_normals(inverse, camera.fx, camera.fy, camera.cx, camera.cy, radius, edge_jump(camera), cosine, normals)
+        images.estimate_normals(
+            inverse,
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            radius,
+            edge_jump(camera),
+            cosine,
+            normals,
+        )
         surfels = ti.ndarray(ti.f32, (*inverse.shape, kernels.CHANNELS))
         kernels.pack_surfels(inverse, normals, intensity, surfels)
         levels.append(SurfelImage(surfels, camera))
@@ -93,11 +111,21 @@ def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
 
 
 def edge_jump(camera: PinholeCamera) -> float:
-    """By which share of the depth neighbouring pixels of one surface may differ: the more, the fewer pixels see it."""
+    """By which share of the depth neighbouring pixels of one surface may differ: the more, the
+    fewer pixels see it.
+    """
     return EDGE_JUMP * max(1.0, FINEST_WIDTH / camera.width)
 
 
 def shrunk(camera: PinholeCamera, factor: int) -> PinholeCamera:
-    """The camera of an image whose pixels are blocks of factor x factor; a remainder at the right and below is left out."""
-    return PinholeCamera(camera.width // factor, camera.height // factor, camera.fx / factor, camera.fy / factor,
-                         (camera.cx + 0.5) / factor - 0.5, (camera.cy + 0.5) / factor - 0.5)
+    """The camera of an image whose pixels are blocks of factor x factor; a remainder at the right
+    and below is left out.
+    """
+    return PinholeCamera(
+        camera.width // factor,
+        camera.height // factor,
+        camera.fx / factor,
+        camera.fy / factor,
+        (camera.cx + 0.5) / factor - 0.5,
+        (camera.cy + 0.5) / factor - 0.5,
+    )

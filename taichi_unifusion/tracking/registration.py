@@ -1,4 +1,6 @@
-"""Coarse-to-fine colored ICP of a frame against one or several others (Sec. V-A.1; Park et al. 2017)."""
+"""Coarse-to-fine colored ICP of a frame against one or several others (Sec. V-A.1; Park et al.
+2017).
+"""
 
 from __future__ import annotations
 
@@ -11,17 +13,19 @@ from numpy.typing import NDArray
 from ..geometry import se3
 from .pyramid import SurfelPyramid
 
-ITERATIONS = (8, 10, 12)      # at most, by level, finest first
-GATES = (0.04, 0.08, 0.16)    # [m] farthest distance of an inlier from the other's plane
-USED_WIDTH = 160              # pixels of the source in a row that are used of a wider image, at least
-MAX_ANGLE = 25.0              # [degrees] between the normals of inliers
-ROBUST_WIDTH = 1.0            # [standard deviations] a distance that counts half
-CONVERGED = 1e-4              # [m, rad] a step below it ends a level
+ITERATIONS = (8, 10, 12)  # at most, by level, finest first
+GATES = (0.04, 0.08, 0.16)  # [m] farthest distance of an inlier from the other's plane
+USED_WIDTH = 160  # pixels of the source in a row that are used of a wider image, at least
+MAX_ANGLE = 25.0  # [degrees] between the normals of inliers
+ROBUST_WIDTH = 1.0  # [standard deviations] a distance that counts half
+CONVERGED = 1e-4  # [m, rad] a step below it ends a level
 FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.005  # of intensities in [0, 1]
-DAMPING = 1e-9                # of the mean diagonal: keeps a blind direction solvable
-MAX_UNCERTAINTY = 0.05        # [m] of the translation in its weakest direction
-MAX_AMBIGUITY = 10.0          # of it to that in its best direction; rooms leave 2 to 6, blank walls 14 to 66
-INDEPENDENT = 192.0           # neighbouring pixels err alike: an image counts as so many measurements, however many it has
+DAMPING = 1e-9  # of the mean diagonal: keeps a blind direction solvable
+MAX_UNCERTAINTY = 0.05  # [m] of the translation in its weakest direction
+# of it to that in its best direction; rooms leave 2 to 6, blank walls 14 to 66
+MAX_AMBIGUITY = 10.0
+# neighbouring pixels err alike: an image counts as so many measurements, however many it has
+INDEPENDENT = 192.0
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,9 @@ class Registration:
     """Where a source frame lies relative to a target frame, and how well it fits there."""
 
     T_target_source: NDArray[np.float64]  # (4, 4)
-    fitness: float    # share of the source's surfels that are inliers
-    rmse: float       # of the inliers' distances from the target's planes [m]
-    overlap: float    # share of the source's surfels that meet surfels of the target
+    fitness: float  # share of the source's surfels that are inliers
+    rmse: float  # of the inliers' distances from the target's planes [m]
+    overlap: float  # share of the source's surfels that meet surfels of the target
     information: NDArray[np.float64]  # (6, 6) of a twist on the left of T_target_source
 
     @property
@@ -41,7 +45,9 @@ class Registration:
 
     @property
     def uncertainty(self) -> NDArray[np.float64]:
-        """Standard deviations (3,) [m] of the translation along its principal axes, best first; infinite where it is open."""
+        """Standard deviations (3,) [m] of the translation along its principal axes, best first;
+        infinite where it is open.
+        """
         values, vectors = np.linalg.eigh(self.information)
         if values[0] <= 0:
             return np.full(3, np.inf)
@@ -50,7 +56,9 @@ class Registration:
 
     @property
     def determined(self) -> bool:
-        """Whether what is seen tells where the camera is; along a blank wall only the noise of its normals does."""
+        """Whether what is seen tells where the camera is; along a blank wall only the noise of its
+        normals does.
+        """
         best, _, weakest = self.uncertainty
         return bool(weakest < MAX_UNCERTAINTY and weakest < MAX_AMBIGUITY * best)
 
@@ -63,12 +71,18 @@ class Target:
     T_target_reference: NDArray[np.float64]
 
 
-def register(source: SurfelPyramid, targets: SurfelPyramid | Sequence[Target], T_reference_source: NDArray,
-             photometric_weight: float = 0.1) -> Registration:
-    """Align `source` to the targets together, from the guess `T_reference_source`, by Gauss-Newton on SE(3).
+def register(
+    source: SurfelPyramid,
+    targets: SurfelPyramid | Sequence[Target],
+    T_reference_source: NDArray,
+    photometric_weight: float = 0.1,
+) -> Registration:
+    """Align `source` to the targets together, from the guess `T_reference_source`, by Gauss-Newton
+    on SE(3).
 
-    Minimises point-to-plane distances, weighted by a Kinect's noise, and intensity differences, weighted by a t distribution
-    whose scale is estimated on the way. A single pyramid is its own reference.
+    Minimises point-to-plane distances, weighted by a Kinect's noise, and intensity differences,
+    weighted by a t distribution whose scale is estimated on the way. A single pyramid is its own
+    reference.
     """
     targets = [Target(targets, np.eye(4))] if isinstance(targets, SurfelPyramid) else targets
     T, sigma = np.array(T_reference_source, np.float64), FIRST_SIGMA
@@ -84,9 +98,14 @@ def register(source: SurfelPyramid, targets: SurfelPyramid | Sequence[Target], T
     return _result(T, _sum(source, targets, T, 0, sigma, photometric_weight))
 
 
-def evaluate(source: SurfelPyramid, target: SurfelPyramid, T_target_source: NDArray, level: int = 0) -> Registration:
+def evaluate(
+    source: SurfelPyramid, target: SurfelPyramid, T_target_source: NDArray, level: int = 0
+) -> Registration:
     """How well `source` fits at a pose that is given."""
-    return _result(T_target_source, _sum(source, [Target(target, np.eye(4))], T_target_source, level, FIRST_SIGMA, 0.0))
+    return _result(
+        T_target_source,
+        _sum(source, [Target(target, np.eye(4))], T_target_source, level, FIRST_SIGMA, 0.0),
+    )
 
 
 @dataclass(frozen=True)
@@ -96,33 +115,48 @@ class _Equations:
     H: NDArray[np.float64]  # (6, 6)
     b: NDArray[np.float64]  # (6,)
     counts: NDArray[np.float64]
-    sigma: float            # of intensity residuals
-    pixels: float           # of the source that were used, whether they have a reading or not
+    sigma: float  # of intensity residuals
+    pixels: float  # of the source that were used, whether they have a reading or not
 
 
-def _sum(source: SurfelPyramid, targets: Sequence[Target], T_reference_source: NDArray, level: int, sigma: float,
-         weight: float) -> _Equations:
+def _sum(
+    source: SurfelPyramid,
+    targets: Sequence[Target],
+    T_reference_source: NDArray,
+    level: int,
+    sigma: float,
+    weight: float,
+) -> _Equations:
     from ..kernels import registration as kernels
 
     H, b, counts = np.zeros((6, 6)), np.zeros(6), np.zeros(kernels.SUMS)
-    limits = np.array([GATES[level], np.cos(np.radians(MAX_ANGLE)), ROBUST_WIDTH, sigma, weight], np.float32)
+    limits = np.array(
+        [GATES[level], np.cos(np.radians(MAX_ANGLE)), ROBUST_WIDTH, sigma, weight], np.float32
+    )
     image = source.levels[level]
-    step = max(1, image.camera.width // USED_WIDTH)  # every so manieth pixel of every so manieth row
+    # every so manieth pixel of every so manieth row
+    step = max(1, image.camera.width // USED_WIDTH)
     for target in targets:
         limits[4] = weight if source.colored and target.pyramid.colored else 0.0
         other = target.pyramid.levels[level]
-        intrinsics = np.array([(c.fx, c.fy, c.cx, c.cy) for c in (image.camera, other.camera)], np.float32)
+        intrinsics = np.array(
+            [(c.fx, c.fy, c.cx, c.cy) for c in (image.camera, other.camera)], np.float32
+        )
         T = np.ascontiguousarray((target.T_target_reference @ T_reference_source)[:3], np.float32)
         rows = -(-image.camera.height // step)
         sums = np.empty((-(-rows // kernels.BLOCK_ROWS), kernels.SUMS), np.float32)
-        kernels.sum_normal_equations(image.surfels, other.surfels, intrinsics, T, step, limits, sums)
+        kernels.sum_normal_equations(
+            image.surfels, other.surfels, intrinsics, T, step, limits, sums
+        )
         total = sums.sum(axis=0, dtype=np.float64)
         A = se3.adjoint(target.T_target_reference)
-        H += A.T @ _symmetric(total[:kernels.H_SIZE]) @ A
-        b += A.T @ total[kernels.H_SIZE:kernels.SOURCE]
+        H += A.T @ _symmetric(total[: kernels.H_SIZE]) @ A
+        b += A.T @ total[kernels.H_SIZE : kernels.SOURCE]
         counts += total
     if counts[kernels.COLORED] > 0:
-        sigma = max(float(np.sqrt(counts[kernels.PHOTOMETRIC_SCALE] / counts[kernels.COLORED])), LEAST_SIGMA)
+        sigma = max(
+            float(np.sqrt(counts[kernels.PHOTOMETRIC_SCALE] / counts[kernels.COLORED])), LEAST_SIGMA
+        )
     return _Equations(H, b, counts, sigma, image.camera.width * image.camera.height / step**2)
 
 
@@ -130,9 +164,18 @@ def _result(T: NDArray, equations: _Equations) -> Registration:
     from ..kernels import registration as kernels
 
     of, inliers = max(equations.counts[kernels.SOURCE], 1.0), equations.counts[kernels.INLIERS]
-    rmse = float(np.sqrt(equations.counts[kernels.SQUARED_DISTANCE] / inliers)) if inliers else float("inf")
-    return Registration(np.asarray(T, np.float64), inliers / of, rmse, equations.counts[kernels.IN_VIEW] / of,
-                        equations.H * (INDEPENDENT / equations.pixels))
+    rmse = (
+        float(np.sqrt(equations.counts[kernels.SQUARED_DISTANCE] / inliers))
+        if inliers
+        else float("inf")
+    )
+    return Registration(
+        np.asarray(T, np.float64),
+        inliers / of,
+        rmse,
+        equations.counts[kernels.IN_VIEW] / of,
+        equations.H * (INDEPENDENT / equations.pixels),
+    )
 
 
 def _symmetric(upper: NDArray) -> NDArray[np.float64]:

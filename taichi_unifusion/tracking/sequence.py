@@ -11,9 +11,9 @@ from io import StringIO
 from pathlib import Path
 
 from ..datasets import Dataset, DatasetView
+from ..datasets.loading import index_in_recording, load_ahead
 from ..errors import FrameError, PoseError
 from ..files.atomic import atomic_write
-from ..datasets.loading import index_in_recording, load_ahead
 from ..run_log import name_of
 from ..types import Frame
 from .base import TrackedFrame, Tracker, TrackingResult, Verdict
@@ -25,9 +25,16 @@ COLUMNS = ("frame", "timestamp", "verdict", "fitness", "rmse_m", "keyframe", "me
 NO_POSE = (Verdict.LOST, Verdict.MISSING, Verdict.UNREADABLE)
 
 
-def track_sequence(sequence: Dataset, tracker: Tracker, *, stop: Callable[[], bool] = lambda: False,
-                   on_frame: Callable[[int, int], None] = lambda done, total: None) -> TrackingResult:
-    """Poses of all frames, final; frames that cannot be loaded or tracked are in it with their reason, and said."""
+def track_sequence(
+    sequence: Dataset,
+    tracker: Tracker,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    on_frame: Callable[[int, int], None] = lambda done, total: None,
+) -> TrackingResult:
+    """Poses of all frames, final; frames that cannot be loaded or tracked are in it with their
+    reason, and said.
+    """
     started, interrupted = time.perf_counter(), False
     frames = sequence if tracker.uses_given_poses else sequence.without_poses()
     for i, load in enumerate(load_ahead(frames)):
@@ -54,9 +61,15 @@ def _warn(result: TrackingResult) -> list[str]:
         if not members:
             continue
         where = runs(result.frames, lambda frame, verdict=verdict: frame.verdict is verdict)
-        what = "keep the pose that was given" if verdict is Verdict.PRIOR_KEPT else f"are not mapped ({verdict})"
-        sentences.append(f"tracking: {len(members)} of {len(result.frames)} frames {what}: {_shortened(where)} "
-                         f"(first: {members[0].message})")
+        what = (
+            "keep the pose that was given"
+            if verdict is Verdict.PRIOR_KEPT
+            else f"are not mapped ({verdict})"
+        )
+        sentences.append(
+            f"tracking: {len(members)} of {len(result.frames)} frames {what}: {_shortened(where)} "
+            f"(first: {members[0].message})"
+        )
     for sentence in sentences:
         logger.warning("%s", sentence)
     return sentences
@@ -67,7 +80,9 @@ def _shortened(where: list[str], most: int = 8) -> str:
 
 
 class PosedFrames(DatasetView):
-    """The frames of a sequence with the poses that a tracker found; one without a pose raises PoseError that says why."""
+    """The frames of a sequence with the poses that a tracker found; one without a pose raises
+    PoseError that says why.
+    """
 
     def __init__(self, sequence: Dataset, tracking: TrackingResult) -> None:
         frames = sequence.without_poses()
@@ -87,8 +102,17 @@ def write_tracking(path: Path, result: TrackingResult) -> None:
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
     for frame in result.frames:
-        table.writerow([frame.index, _number(frame.timestamp, "r"), frame.verdict, _number(frame.fitness, ".4f"),
-                        _number(frame.rmse, ".6f"), "" if frame.keyframe is None else frame.keyframe, frame.message])
+        table.writerow(
+            [
+                frame.index,
+                _number(frame.timestamp, "r"),
+                frame.verdict,
+                _number(frame.fitness, ".4f"),
+                _number(frame.rmse, ".6f"),
+                "" if frame.keyframe is None else frame.keyframe,
+                frame.message,
+            ]
+        )
     with atomic_write(path) as temporary:
         temporary.write_text(text.getvalue(), encoding="utf-8")
 

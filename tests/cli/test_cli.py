@@ -1,4 +1,6 @@
-"""The command line as a user meets it: exit codes, messages, files, and what a bad day leaves behind."""
+"""The command line as a user meets it: exit codes, messages, files, and what a bad day leaves
+behind.
+"""
 
 from __future__ import annotations
 
@@ -22,21 +24,30 @@ from tiny_recording import CONFIG, DEVICE, FLAGS, make_frames, write_folder
 
 import taichi_unifusion as uf
 from taichi_unifusion.cli import main as cli
-from taichi_unifusion.results import writer as results
 from taichi_unifusion.cli.info import Info
 from taichi_unifusion.config import Config, dump_config, load_config
-from taichi_unifusion.files.trajectories import read_trajectory
-from taichi_unifusion.files.meshes import read_mesh
 from taichi_unifusion.files.maps import read_map
+from taichi_unifusion.files.meshes import read_mesh
+from taichi_unifusion.files.trajectories import read_trajectory
+from taichi_unifusion.results import writer as results
 
 ROOT = Path(__file__).resolve().parents[2]
-OUTPUTS = ["config.yaml", "maps/color.safetensors", "maps/surface.safetensors", "mesh.glb", "mesh.ply", "metrics.json",
-           "preview.png", "trajectory.txt"]
-FILE_LIMIT = 20_000   # bytes; trajectory, configuration and metrics are smaller, maps, meshes and preview larger
+OUTPUTS = [
+    "config.yaml",
+    "maps/color.safetensors",
+    "maps/surface.safetensors",
+    "mesh.glb",
+    "mesh.ply",
+    "metrics.json",
+    "preview.png",
+    "trajectory.txt",
+]
+# bytes; trajectory, configuration and metrics are smaller, maps, meshes and preview larger
+FILE_LIMIT = 20_000
 LINKED_FRAMES = 3000  # enough to be interrupted in the middle on any machine
-SAME_VERTEX = 2e-6    # [m] rounding of float32: another map's kernels are compiled anew
+SAME_VERTEX = 2e-6  # [m] rounding of float32: another map's kernels are compiled anew
 SAME_COLOR = 1.01 / 255  # 8-bit colours that round the other way
-PATIENCE = 120        # [s] for a process that has to start Taichi on a busy machine
+PATIENCE = 120  # [s] for a process that has to start Taichi on a busy machine
 
 
 @pytest.fixture(scope="module")
@@ -68,30 +79,81 @@ def files_in(folder: Path) -> list[str]:
 # --- Exit codes and messages ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("arguments", "code", "told"), [
-    (["--help"], 0, ["reconstruct", "transfer", "mesh", "info", "config"]),
-    (["--version"], 0, [f"unifusion {uf.__version__}"]),
-    (["reconstruct", "--help"], 0, ["FORMAT", "synthetic, 7scenes, replica, tum, scannet, k4a, folder", "--every",
-                                    "unifusion config --help"]),
-    (["transfer", "--help"], 0, ["--property NAME[=SETTINGS]", "infrared, saliency, style, images, normal, curvature"]),
-    (["config", "--help"], 0, ["--surface.voxel-size", "--preprocess.depth-max", "--mesh.resolution"]),
-    ([], 2, ["reconstruct, transfer, understand, query, segment, mesh, info, config"]),
-    (["reconstrukt"], 2, ["reconstruct, transfer, understand, query, segment, mesh, info, config"]),
-    (["reconstruct", "7scene", "x", "--out", "o"], 2, ["'7scene' is unknown, did you mean '7scenes'?", "scannet"]),
-    (["reconstruct", "folder", "nowhere", "--out", "o"], 2, ["nowhere: no such file or folder"]),
-    (["reconstruct", "synthetic"], 2, ["--out"]),
-    (["reconstruct", "synthetic", "--out", "o", "--surface.voxel-siz", "1"], 2, ["--surface.voxel-size"]),
-    (["reconstruct", "synthetic", "--out", "o", "--surface.voxel-size", "-1"], 2, ["voxel_size: must lie between"]),
-    (["reconstruct", "synthetic", "--out", "o", "--depth-scale", "1000"], 2, ["'depth_scale' is unknown for format"]),
-    (["reconstruct", "synthetic", "--out", "o", "--start", "60"], 2, ["there is no frame 60, it has 60 (0 is the first)"]),
-    (["reconstruct", "synthetic", "--out", "o", "--every", "0"], 2, ["every >= 1"]),
-    (["reconstruct", "synthetic", "--out", "o", "--start", "5", "--end", "5"], 2, ["start < end"]),
-    (["config", "--device", "gpu"], 2, ["auto", "cuda", "cpu"]),
-    (["config", "--config", "none.yaml"], 2, ["none.yaml: no such file"]),
-    (["info", "nowhere"], 2, ["nowhere: no such file or folder"]),
-    (["mesh", "nowhere"], 2, ["nowhere: no maps/surface.safetensors"]),
-    (["mesh", "nowhere", "--out", "x.stl"], 2, [".ply, .glb, .obj"]),
-])
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        (["--help"], 0, ["reconstruct", "transfer", "mesh", "info", "config"]),
+        (["--version"], 0, [f"unifusion {uf.__version__}"]),
+        (
+            ["reconstruct", "--help"],
+            0,
+            [
+                "FORMAT",
+                "synthetic, 7scenes, replica, tum, scannet, k4a, folder",
+                "--every",
+                "unifusion config --help",
+            ],
+        ),
+        (
+            ["transfer", "--help"],
+            0,
+            ["--property NAME[=SETTINGS]", "infrared, saliency, style, images, normal, curvature"],
+        ),
+        (
+            ["config", "--help"],
+            0,
+            ["--surface.voxel-size", "--preprocess.depth-max", "--mesh.resolution"],
+        ),
+        ([], 2, ["reconstruct, transfer, understand, query, segment, mesh, info, config"]),
+        (
+            ["reconstrukt"],
+            2,
+            ["reconstruct, transfer, understand, query, segment, mesh, info, config"],
+        ),
+        (
+            ["reconstruct", "7scene", "x", "--out", "o"],
+            2,
+            ["'7scene' is unknown, did you mean '7scenes'?", "scannet"],
+        ),
+        (
+            ["reconstruct", "folder", "nowhere", "--out", "o"],
+            2,
+            ["nowhere: no such file or folder"],
+        ),
+        (["reconstruct", "synthetic"], 2, ["--out"]),
+        (
+            ["reconstruct", "synthetic", "--out", "o", "--surface.voxel-siz", "1"],
+            2,
+            ["--surface.voxel-size"],
+        ),
+        (
+            ["reconstruct", "synthetic", "--out", "o", "--surface.voxel-size", "-1"],
+            2,
+            ["voxel_size: must lie between"],
+        ),
+        (
+            ["reconstruct", "synthetic", "--out", "o", "--depth-scale", "1000"],
+            2,
+            ["'depth_scale' is unknown for format"],
+        ),
+        (
+            ["reconstruct", "synthetic", "--out", "o", "--start", "60"],
+            2,
+            ["there is no frame 60, it has 60 (0 is the first)"],
+        ),
+        (["reconstruct", "synthetic", "--out", "o", "--every", "0"], 2, ["every >= 1"]),
+        (
+            ["reconstruct", "synthetic", "--out", "o", "--start", "5", "--end", "5"],
+            2,
+            ["start < end"],
+        ),
+        (["config", "--device", "gpu"], 2, ["auto", "cuda", "cpu"]),
+        (["config", "--config", "none.yaml"], 2, ["none.yaml: no such file"]),
+        (["info", "nowhere"], 2, ["nowhere: no such file or folder"]),
+        (["mesh", "nowhere"], 2, ["nowhere: no maps/surface.safetensors"]),
+        (["mesh", "nowhere", "--out", "x.stl"], 2, [".ply, .glb, .obj"]),
+    ],
+)
 def test_V4_exit_codes_and_messages(arguments, code, told, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert cli.main(arguments) == code
@@ -119,7 +181,9 @@ def test_debug_shows_where_an_error_comes_from(monkeypatch):
 
 def test_a_reader_that_leaves_early_is_no_error():
     code = "import sys\nfrom taichi_unifusion.cli.main import main\nsys.exit(main(['config', '--help']))"
-    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     process.stdout.close()
     assert process.stderr.read() == b"" and process.wait() == 0
     process.stderr.close()
@@ -150,7 +214,10 @@ def test_flags_count_more_than_the_file_and_the_file_more_than_defaults(tmp_path
 def test_an_unknown_key_names_the_right_ones(tmp_path, capsys):
     path = tmp_path / "some.yaml"
     path.write_text("surface: {voxelsize: 1}\n")
-    assert cli.main(["reconstruct", "synthetic", "--config", str(path), "--out", str(tmp_path / "o")]) == 2
+    assert (
+        cli.main(["reconstruct", "synthetic", "--config", str(path), "--out", str(tmp_path / "o")])
+        == 2
+    )
     assert "'surface.voxelsize', did you mean 'voxel_size'?" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
@@ -164,30 +231,74 @@ def test_the_results_folder_holds_everything(made):
     assert len(mesh.faces) > 0 and mesh.normals is not None and "color" in mesh.attributes
     assert load_config(made / "config.yaml") == CONFIG
     assert len(read_trajectory(made / "trajectory.txt")) == 3
-    assert (made / "preview.png").read_bytes()[:4] == b"\x89PNG" and (made / "mesh.glb").read_bytes()[:4] == b"glTF"
+    assert (made / "preview.png").read_bytes()[:4] == b"\x89PNG" and (
+        made / "mesh.glb"
+    ).read_bytes()[:4] == b"glTF"
 
 
 def test_the_metrics_agree_with_the_files(made):
     metrics = json.loads((made / "metrics.json").read_text())
     mesh = read_mesh(made / "mesh.ply")
     assert metrics["mesh"] == {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
-    assert (metrics["device"], metrics["frames"]["used"], metrics["frames"]["skipped"]) == (DEVICE, 3, 0)
-    assert list(metrics["milliseconds"]) == ["load", "preprocess", "transform", "surface", "color", "frame"]
-    assert all(value["median"] > 0 and value["mean"] > 0 for stage, value in metrics["milliseconds"].items() if stage != "load")
+    assert (metrics["device"], metrics["frames"]["used"], metrics["frames"]["skipped"]) == (
+        DEVICE,
+        3,
+        0,
+    )
+    assert list(metrics["milliseconds"]) == [
+        "load",
+        "preprocess",
+        "transform",
+        "surface",
+        "color",
+        "frame",
+    ]
+    assert all(
+        value["median"] > 0 and value["mean"] > 0
+        for stage, value in metrics["milliseconds"].items()
+        if stage != "load"
+    )
     for name, entry in metrics["maps"].items():
         file = made / "maps" / f"{name}.safetensors"
-        assert (entry["voxels"], entry["file_bytes"]) == (len(read_map(file)[0]["keys"]), file.stat().st_size)
+        assert (entry["voxels"], entry["file_bytes"]) == (
+            len(read_map(file)[0]["keys"]),
+            file.stat().st_size,
+        )
         assert entry["bytes"] > 0
-    assert metrics["peak_memory_bytes"] > 50e6 and metrics["seconds"]["mesh"] > 0 and "taichi" in metrics["versions"]
+    assert (
+        metrics["peak_memory_bytes"] > 50e6
+        and metrics["seconds"]["mesh"] > 0
+        and "taichi" in metrics["versions"]
+    )
     assert metrics["errors"] == metrics["warnings"] == []
 
 
 def test_V4_json_alone_on_stdout_and_no_bar_without_a_screen(recording, tmp_path, capfd):
-    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--start", "1", "--every", "5", "--json",
-                     "--mesh.formats", "obj", "--out", str(tmp_path)]) == 0
+    assert (
+        cli.main(
+            [
+                "reconstruct",
+                "folder",
+                str(recording),
+                *FLAGS,
+                "--start",
+                "1",
+                "--every",
+                "5",
+                "--json",
+                "--mesh.formats",
+                "obj",
+                "--out",
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
     captured = capfd.readouterr()
     metrics = json.loads(captured.out)
-    assert metrics["frames"]["used"] == 1 and metrics == json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["frames"]["used"] == 1 and metrics == json.loads(
+        (tmp_path / "metrics.json").read_text()
+    )
     assert "frame 1 of 1" in captured.err
     assert "\x1b" not in captured.err and "\r" not in captured.err and "━" not in captured.err
     assert (tmp_path / "mesh.obj").exists() and not (tmp_path / "mesh.ply").exists()
@@ -198,9 +309,15 @@ def test_F7_a_truncated_image_is_skipped_listed_and_the_run_ends_well(spoiled, t
     assert cli.main(arguments) == 0
     captured = capsys.readouterr()
     image = str(spoiled / "depth" / "1.png")
-    assert "2 used, 1 skipped" in captured.out and image in captured.out and captured.err.count(image) == 1
+    assert (
+        "2 used, 1 skipped" in captured.out
+        and image in captured.out
+        and captured.err.count(image) == 1
+    )
     frames = json.loads((tmp_path / "out" / "metrics.json").read_text())["frames"]
-    assert [(entry["frame"], image in entry["message"]) for entry in frames["skipped_frames"]] == [(1, True)]
+    assert [(entry["frame"], image in entry["message"]) for entry in frames["skipped_frames"]] == [
+        (1, True)
+    ]
 
     assert cli.main([*arguments, "--strict"]) == 2  # and the results so far are on disk
     captured = capsys.readouterr()
@@ -212,14 +329,33 @@ def test_F7_a_truncated_image_is_skipped_listed_and_the_run_ends_well(spoiled, t
 
 def test_no_usable_frame_is_an_error_and_writes_nothing(recording, tmp_path, capsys):
     out = tmp_path / "out"
-    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--depth-scale", "1e6", "--out", str(out)]) == 2
+    assert (
+        cli.main(
+            [
+                "reconstruct",
+                "folder",
+                str(recording),
+                *FLAGS,
+                "--depth-scale",
+                "1e6",
+                "--out",
+                str(out),
+            ]
+        )
+        == 2
+    )
     error = capsys.readouterr().err
-    assert "none of 3 frames could be used, 3 for 'no usable depth'" in error and "is depth_scale 1000" in error
+    assert (
+        "none of 3 frames could be used, 3 for 'no usable depth'" in error
+        and "is depth_scale 1000" in error
+    )
     assert files_in(out) == []
 
 
 @pytest.mark.parametrize("what", ["a file stands in the way", "read-only"])
-def test_R6_a_folder_that_cannot_be_written_is_told_before_the_first_frame(what, recording, tmp_path, capsys):
+def test_R6_a_folder_that_cannot_be_written_is_told_before_the_first_frame(
+    what, recording, tmp_path, capsys
+):
     target = tmp_path / "taken"
     if what == "read-only":
         target.mkdir(mode=0o500)
@@ -227,7 +363,10 @@ def test_R6_a_folder_that_cannot_be_written_is_told_before_the_first_frame(what,
             pytest.skip("this user may write anywhere")
     else:
         target.write_text("mine")
-    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--out", str(target / "out")]) == 2
+    assert (
+        cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--out", str(target / "out")])
+        == 2
+    )
     error = capsys.readouterr().err
     assert str(target / "out") in error and "frame 1 of" not in error
 
@@ -255,11 +394,18 @@ def test_one_failing_output_does_not_cost_the_others(recording, tmp_path, monkey
     write_mesh = results.write_mesh
     monkeypatch.setattr(results, "write_mesh", full)
     monkeypatch.setattr(results, "render_preview", broken)
-    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(tmp_path)]) == 2
+    assert (
+        cli.main(
+            ["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(tmp_path)]
+        )
+        == 2
+    )
     error = capsys.readouterr().err
     assert f"{tmp_path / 'mesh.glb'}: could not be written" in error and "No space left" in error
     assert f"{tmp_path / 'preview.png'}: could not be written" in error and "out of ink" in error
-    assert files_in(tmp_path) == [name for name in OUTPUTS if name not in ("mesh.glb", "preview.png")]
+    assert files_in(tmp_path) == [
+        name for name in OUTPUTS if name not in ("mesh.glb", "preview.png")
+    ]
     assert len(json.loads((tmp_path / "metrics.json").read_text())["errors"]) == 2
 
 
@@ -268,7 +414,12 @@ def test_R5_a_file_size_limit_keeps_the_old_files_whole(recording, made, tmp_pat
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_LIMIT, hard))
     try:
-        assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(out)]) == 2
+        assert (
+            cli.main(
+                ["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(out)]
+            )
+            == 2
+        )
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     error = capsys.readouterr().err
@@ -280,10 +431,27 @@ def test_R5_a_file_size_limit_keeps_the_old_files_whole(recording, made, tmp_pat
 
 
 def test_an_empty_mesh_is_said_and_the_rest_is_written(recording, tmp_path, capsys):
-    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--surface.min-points", "100000",
-                     "--out", str(tmp_path)]) == 2
+    assert (
+        cli.main(
+            [
+                "reconstruct",
+                "folder",
+                str(recording),
+                *FLAGS,
+                "--end",
+                "1",
+                "--surface.min-points",
+                "100000",
+                "--out",
+                str(tmp_path),
+            ]
+        )
+        == 2
+    )
     assert "the mesh is empty" in capsys.readouterr().err
-    assert files_in(tmp_path) == [name for name in OUTPUTS if name not in ("mesh.glb", "preview.png")]
+    assert files_in(tmp_path) == [
+        name for name in OUTPUTS if name not in ("mesh.glb", "preview.png")
+    ]
 
 
 # --- Signals --------------------------------------------------------------------------------------------------------
@@ -291,7 +459,9 @@ def test_an_empty_mesh_is_said_and_the_rest_is_written(recording, tmp_path, caps
 
 @pytest.fixture
 def long_run(recording, tmp_path):
-    """A `reconstruct` process in the middle of its frames, its results folder, and its stderr as lines that wait for it."""
+    """A `reconstruct` process in the middle of its frames, its results folder, and its stderr as
+    lines that wait for it.
+    """
     folder = tmp_path / "long"
     for name in ("depth", "color", "poses"):
         (folder / name).mkdir(parents=True)
@@ -301,8 +471,23 @@ def long_run(recording, tmp_path):
     shutil.copy(recording / "camera.yaml", folder)
     out = tmp_path / "out"
     code = "import sys\nfrom taichi_unifusion.cli.main import main\nsys.exit(main(sys.argv[1:]))"
-    process = subprocess.Popen([sys.executable, "-c", code, "reconstruct", "folder", str(folder), *FLAGS, "--out", str(out)],
-                               cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            code,
+            "reconstruct",
+            "folder",
+            str(folder),
+            *FLAGS,
+            "--out",
+            str(out),
+        ],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     watchdog = threading.Timer(PATIENCE, process.kill)
     watchdog.start()
     wait_for(process, "frame 1 of")
@@ -354,7 +539,12 @@ def test_a_signal_while_writing_finishes_the_writing(recording, tmp_path, monkey
 
     render_preview, before = results.render_preview, signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(results, "render_preview", interrupted)
-    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(tmp_path)]) == 130
+    assert (
+        cli.main(
+            ["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(tmp_path)]
+        )
+        == 130
+    )
     assert "stopping: " in capfd.readouterr().err
     assert files_in(tmp_path) == OUTPUTS
     assert signal.getsignal(signal.SIGINT) is before  # which a shell may have set to ignore it
@@ -365,7 +555,10 @@ def test_a_signal_while_writing_finishes_the_writing(recording, tmp_path, monkey
 
 def test_mesh_extracts_again_finer(made, tmp_path, capsys):
     out = tmp_path / "finer.ply"
-    assert cli.main(["mesh", str(made), "--resolution", "8", "--out", str(out), "--device", DEVICE]) == 0
+    assert (
+        cli.main(["mesh", str(made), "--resolution", "8", "--out", str(out), "--device", DEVICE])
+        == 0
+    )
     before, after = read_mesh(made / "mesh.ply"), read_mesh(out)
     assert len(after.faces) > 3 * len(before.faces)  # triangles of a surface grow with the square
     assert "color" in after.attributes
@@ -378,16 +571,29 @@ def test_mesh_extracts_again_finer(made, tmp_path, capsys):
     again = read_mesh(copy / "mesh.ply")
     np.testing.assert_array_equal(again.faces, before.faces)
     np.testing.assert_allclose(again.vertices, before.vertices, atol=SAME_VERTEX)
-    np.testing.assert_allclose(again.attributes["color"], before.attributes["color"], atol=SAME_COLOR)
+    np.testing.assert_allclose(
+        again.attributes["color"], before.attributes["color"], atol=SAME_COLOR
+    )
     assert (copy / "mesh.glb").exists()
 
 
 def test_info_describes_a_folder_a_map_and_a_mesh(made, recording, capsys):
-    voxels = {name: f"{len(read_map(made / 'maps' / f'{name}.safetensors')[0]['keys']):,}" for name in ("surface", "color")}
+    voxels = {
+        name: f"{len(read_map(made / 'maps' / f'{name}.safetensors')[0]['keys']):,}"
+        for name in ("surface", "color")
+    }
     assert cli.main(["info", str(made)]) == 0
     text = capsys.readouterr().out
-    for part in (*voxels.values(), "10 cm", "5 cm", "rank 20 of 256", "triangles", "normals, color", "3 used, 0 skipped",
-                 f"folder {recording}, frames 0 to the last"):
+    for part in (
+        *voxels.values(),
+        "10 cm",
+        "5 cm",
+        "rank 20 of 256",
+        "triangles",
+        "normals, color",
+        "3 used, 0 skipped",
+        f"folder {recording}, frames 0 to the last",
+    ):
         assert part in text
     assert cli.main(["info", str(made / "maps" / "color.safetensors")]) == 0
     assert voxels["color"] in capsys.readouterr().out
@@ -404,7 +610,11 @@ def test_M2_info_names_a_damaged_map_and_still_shows_the_rest(made, tmp_path, ca
     (copy / "metrics.json").write_text("{}")
     assert cli.main(["info", str(copy)]) == 2
     captured = capsys.readouterr()
-    assert f"{path}: tensor" in captured.err and "checksum" in captured.err and "metrics.json" in captured.err
+    assert (
+        f"{path}: tensor" in captured.err
+        and "checksum" in captured.err
+        and "metrics.json" in captured.err
+    )
     assert "property, 3 channels" in captured.out and "triangles" in captured.out
     assert cli.main(["mesh", str(copy), "--device", DEVICE]) == 2
     assert "checksum" in capsys.readouterr().err
@@ -417,12 +627,15 @@ def test_mesh_refuses_a_map_of_another_kind(made, tmp_path, capsys):
     assert "kind 'property', not 'surface'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("name", "content", "told"), [
-    ("x.safetensors", b"", "the file is empty"),
-    ("x.safetensors", b"\x80\x04pickle..........", "a pickle"),
-    ("x.png", b"\x89PNG\r\n\x1a\n", "not a map file"),
-    ("x.ply", b"ply\n", "x.ply"),
-])
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("x.safetensors", b"", "the file is empty"),
+        ("x.safetensors", b"\x80\x04pickle..........", "a pickle"),
+        ("x.png", b"\x89PNG\r\n\x1a\n", "not a map file"),
+        ("x.ply", b"ply\n", "x.ply"),
+    ],
+)
 def test_info_on_what_is_not_ours_is_one_sentence(tmp_path, capsys, name, content, told):
     path = tmp_path / name
     path.write_bytes(content)

@@ -1,4 +1,6 @@
-"""`unifusion evaluate` as a user meets it: which frames and meshes it takes, tables, JSON, one sentence for what is wrong."""
+"""`unifusion evaluate` as a user meets it: which frames and meshes it takes, tables, JSON, one
+sentence for what is wrong.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +17,15 @@ from taichi_unifusion import Trajectory, load_map, open_dataset
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.errors import FileError
 from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
-from taichi_unifusion.geometry import triangles as geometry
 from taichi_unifusion.files.foreign_meshes import read_any_mesh
-from taichi_unifusion.results.reader import read_run
-from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
 from taichi_unifusion.files.meshes import read_mesh
+from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
+from taichi_unifusion.geometry import triangles as geometry
+from taichi_unifusion.results.reader import read_run
 
-FRAMES, EVERY = 7, 3     # frames 0, 3 and 6 are used
+FRAMES, EVERY = 7, 3  # frames 0, 3 and 6 are used
 SAMPLES = "3000"
-SAME = 1e-6              # relative: the same code on the same files
+SAME = 1e-6  # relative: the same code on the same files
 
 
 @pytest.fixture(autouse=True)
@@ -41,8 +43,23 @@ def recording(tmp_path_factory):
 def results(recording, tmp_path_factory):
     """A results folder; tests that change it work on a copy."""
     out = tmp_path_factory.mktemp("results") / "made"
-    assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--every", str(EVERY), "--mesh.formats", "ply",
-                     "--out", str(out)]) == 0
+    assert (
+        cli.main(
+            [
+                "reconstruct",
+                "folder",
+                str(recording),
+                *FLAGS,
+                "--every",
+                str(EVERY),
+                "--mesh.formats",
+                "ply",
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     return out
 
 
@@ -56,6 +73,7 @@ def truth(tmp_path_factory):
 @pytest.fixture
 def evaluate(capsys):
     """Runs the command and gives its JSON, after it ended well."""
+
     def run(*arguments):
         capsys.readouterr()
         assert cli.main(["evaluate", *map(str, arguments), "--json"]) == 0
@@ -67,6 +85,7 @@ def evaluate(capsys):
 @pytest.fixture
 def told(capsys):
     """Runs the command and gives what it says on its way to exit code 2."""
+
     def run(*arguments):
         capsys.readouterr()
         assert cli.main(["evaluate", *map(str, arguments)]) == 2
@@ -94,16 +113,21 @@ def test_a_run_knows_its_frames_camera_and_poses(results, recording):
     assert (run.format, run.path, run.used) == ("folder", recording, (0, 3, 6))
     assert run.views().camera == make_frames(1)[0].camera and len(run.recording()) == FRAMES
     assert (run.T_recording_run() == np.eye(4)).all()
-    np.testing.assert_allclose(run.trajectory().T_world_camera, run.true_trajectory().T_world_camera, atol=1e-8)
+    np.testing.assert_allclose(
+        run.trajectory().T_world_camera, run.true_trajectory().T_world_camera, atol=1e-8
+    )
     limits = run.config().preprocess
     assert (run.views().depth_min, run.views().depth_max) == (limits.depth_min, limits.depth_max)
 
 
-@pytest.mark.parametrize(("frames", "used"), [
-    ({"used": 2, "skipped_frames": [{"frame": 3, "message": ""}]}, (0, 6)),
-    ({"used": 1, "skipped_frames": []}, (0,)),                                # stopped after the first
-    ({"used": 1, "skipped_frames": [{"frame": 0, "message": ""}]}, (3,)),
-])
+@pytest.mark.parametrize(
+    ("frames", "used"),
+    [
+        ({"used": 2, "skipped_frames": [{"frame": 3, "message": ""}]}, (0, 6)),
+        ({"used": 1, "skipped_frames": []}, (0,)),  # stopped after the first
+        ({"used": 1, "skipped_frames": [{"frame": 0, "message": ""}]}, (3,)),
+    ],
+)
 def test_frames_skipped_or_never_reached_are_not_used(results, tmp_path, frames, used):
     folder = with_metrics(results, tmp_path / "copy")
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -112,8 +136,16 @@ def test_frames_skipped_or_never_reached_are_not_used(results, tmp_path, frames,
     assert read_run(folder).used == used
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"recording": 3, "frames": {}}',
-                                  '{"recording": {"start": "x"}, "frames": {"skipped_frames": []}}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"recording": 3, "frames": {}}',
+        '{"recording": {"start": "x"}, "frames": {"skipped_frames": []}}',
+    ],
+)
 def test_damaged_metrics_are_told(results, tmp_path, text):
     folder = with_metrics(results, tmp_path / "copy")
     (folder / "metrics.json").write_text(text)
@@ -132,15 +164,21 @@ def test_surface_of_a_results_folder_is_judged_by_what_its_frames_saw(results, t
     views = Views(camera, run.trajectory().T_world_camera, limits.depth_min, limits.depth_max)
     known = evaluate_surface(run.mesh(), read_mesh(truth), views=views, samples=int(SAMPLES))
     assert found["accuracy_cm"] == pytest.approx(known.accuracy_cm, rel=SAME)
-    assert [s["f1"] for s in found["scores"]] == pytest.approx([s.f1 for s in known.scores], rel=SAME)
+    assert [s["f1"] for s in found["scores"]] == pytest.approx(
+        [s.f1 for s in known.scores], rel=SAME
+    )
     assert found["ground_truth_unseen"] > 0.5 and found["seen_by"] == str(results)
-    whole = evaluate("surface", results, truth, "--whole", "--samples", SAMPLES, "--thresholds", "0.05")
+    whole = evaluate(
+        "surface", results, truth, "--whole", "--samples", SAMPLES, "--thresholds", "0.05"
+    )
     seen = evaluate("surface", results, truth, "--samples", SAMPLES, "--thresholds", "0.05")
     assert whole["scores"][0]["recall"] < 0.5 < seen["scores"][0]["recall"]
     assert (whole["ground_truth_unseen"], whole["seen_by"], len(whole["scores"])) == (0, None, 1)
 
 
-def test_surface_of_a_mesh_file_is_judged_whole_or_by_another_run(results, truth, evaluate, tmp_path):
+def test_surface_of_a_mesh_file_is_judged_whole_or_by_another_run(
+    results, truth, evaluate, tmp_path
+):
     mesh = shutil.copy(results / "mesh.ply", tmp_path / "other.ply")
     assert evaluate("surface", mesh, truth, "--samples", SAMPLES)["ground_truth_unseen"] == 0
     seen = evaluate("surface", mesh, truth, "--seen-by", results, "--samples", SAMPLES)
@@ -149,19 +187,41 @@ def test_surface_of_a_mesh_file_is_judged_whole_or_by_another_run(results, truth
 
 def test_surface_without_a_truth_takes_the_recordings_own(results, truth, evaluate, tmp_path):
     folder = with_metrics(results, tmp_path / "copy", format="synthetic", path="")
-    own, given = (evaluate("surface", *arguments, "--samples", SAMPLES) for arguments in ((folder,), (folder, truth)))
+    own, given = (
+        evaluate("surface", *arguments, "--samples", SAMPLES)
+        for arguments in ((folder,), (folder, truth))
+    )
     assert own["scores"] == given["scores"] and own["ground_truth"] == "the recording's"
 
 
 def test_surface_table_and_file(results, truth, capsys, tmp_path):
     file = tmp_path / "scores" / "surface.json"
-    assert cli.main(["evaluate", "surface", str(results), str(truth), "--samples", SAMPLES, "--to", "samples",
-                     "--out", str(file)]) == 0
+    assert (
+        cli.main(
+            [
+                "evaluate",
+                "surface",
+                str(results),
+                str(truth),
+                "--samples",
+                SAMPLES,
+                "--to",
+                "samples",
+                "--out",
+                str(file),
+            ]
+        )
+        == 0
+    )
     captured, written = capsys.readouterr(), json.loads(file.read_text())
     lines = captured.out.splitlines()
     assert lines[0].split() == ["within", "cm", "precision", "%", "recall", "%", "F1", "%"]
     assert float(lines[1].split()[-1]) == pytest.approx(100 * written["scores"][0]["f1"], abs=0.051)
-    assert "3 frames could tell" in captured.out and written["distance_to"] == "samples" and "\x1b" not in captured.out
+    assert (
+        "3 frames could tell" in captured.out
+        and written["distance_to"] == "samples"
+        and "\x1b" not in captured.out
+    )
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".stl", ".off"])
@@ -171,44 +231,67 @@ def test_meshes_of_other_programs_are_read(suffix, tmp_path):
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(tmp_path / f"mesh{suffix}")
     found = read_any_mesh(tmp_path / f"mesh{suffix}")
     assert len(found.faces) == 4
-    np.testing.assert_allclose(np.sort(found.vertices[found.faces].reshape(-1, 3), axis=0),
-                               np.sort(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0), atol=1e-6)
+    np.testing.assert_allclose(
+        np.sort(found.vertices[found.faces].reshape(-1, 3), axis=0),
+        np.sort(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0),
+        atol=1e-6,
+    )
 
 
 # --- rendering ------------------------------------------------------------------------------------------------------
 
 
-def test_rendering_takes_held_out_frames_half_way_between_the_used_ones(results, recording, evaluate):
+def test_rendering_takes_held_out_frames_half_way_between_the_used_ones(
+    results, recording, evaluate
+):
     found = evaluate("rendering", results)
-    assert [frame["index"] for frame in found["frames"]] == [1, 4] and found["used_by_the_run"] == []
+    assert [frame["index"] for frame in found["frames"]] == [1, 4] and found[
+        "used_by_the_run"
+    ] == []
     limits = read_run(results).config().preprocess
     frames = open_dataset("folder", recording)
-    known = evaluate_rendering(read_mesh(results / "mesh.ply"), [frames[1], frames[4]],
-                               color=load_map(results / "maps" / "color.safetensors").query,
-                               depth_min=limits.depth_min, depth_max=limits.depth_max)
+    known = evaluate_rendering(
+        read_mesh(results / "mesh.ply"),
+        [frames[1], frames[4]],
+        color=load_map(results / "maps" / "color.safetensors").query,
+        depth_min=limits.depth_min,
+        depth_max=limits.depth_max,
+    )
     for name in ("depth_l1_cm", "depth_median_cm", "coverage", "psnr_db", "ssim"):
-        assert found[name] == pytest.approx(getattr(known, name), rel=1e-4)  # the map's kernels are compiled anew
+        # the map's kernels are compiled anew
+        assert found[name] == pytest.approx(getattr(known, name), rel=1e-4)
     assert found["depth_l1_cm"] < 20 and found["coverage"] > 0.5 and found["psnr_db"] > 15
 
 
-@pytest.mark.parametrize(("flags", "frames", "used"), [
-    (["--start", "2"], [2, 4, 5], []),
-    (["--end", "4"], [1, 2], []),
-    (["--every", "2", "--all"], [0, 2, 4, 6], [0, 6]),
-    (["--every", "2"], [2, 4], []),
-    (["--all"], [0, 3, 6], [0, 3, 6]),
-    (["--start", "3", "--end", "5", "--all"], [3, 4], [3]),
-    (["--all", "--end", "1"], [0], [0]),
-])
+@pytest.mark.parametrize(
+    ("flags", "frames", "used"),
+    [
+        (["--start", "2"], [2, 4, 5], []),
+        (["--end", "4"], [1, 2], []),
+        (["--every", "2", "--all"], [0, 2, 4, 6], [0, 6]),
+        (["--every", "2"], [2, 4], []),
+        (["--all"], [0, 3, 6], [0, 3, 6]),
+        (["--start", "3", "--end", "5", "--all"], [3, 4], [3]),
+        (["--all", "--end", "1"], [0], [0]),
+    ],
+)
 def test_rendering_takes_the_frames_that_are_asked_for(results, evaluate, flags, frames, used):
     found = evaluate("rendering", results, *flags)
-    assert [frame["index"] for frame in found["frames"]] == frames and found["used_by_the_run"] == used
+    assert [frame["index"] for frame in found["frames"]] == frames and found[
+        "used_by_the_run"
+    ] == used
 
 
-def test_rendering_stays_between_the_runs_first_and_last_frame(results, recording, evaluate, tmp_path):
+def test_rendering_stays_between_the_runs_first_and_last_frame(
+    results, recording, evaluate, tmp_path
+):
     longer = write_folder(tmp_path / "longer", [*make_frames(FRAMES), *make_frames(6)])
-    for flags, frames in (([], [1, 4, 7]), (["--every", "2"], [2, 4, 8]), (["--start", "7", "--end", "11"], [7, 8, 9, 10]),
-                          (["--start", "11"], [11, 12])):
+    for flags, frames in (
+        ([], [1, 4, 7]),
+        (["--every", "2"], [2, 4, 8]),
+        (["--start", "7", "--end", "11"], [7, 8, 9, 10]),
+        (["--start", "11"], [11, 12]),
+    ):
         found = evaluate("rendering", results, "folder", longer, *flags)
         assert [frame["index"] for frame in found["frames"]] == frames
 
@@ -225,14 +308,28 @@ def test_rendering_of_a_recording_that_was_moved(results, recording, evaluate, t
     moved = shutil.copytree(recording, tmp_path / "elsewhere")
     lost = with_metrics(results, tmp_path / "copy", path=str(tmp_path / "gone"))
     assert "was made from folder" in told("rendering", lost)
-    assert [frame["index"] for frame in evaluate("rendering", lost, "folder", moved)["frames"]] == [1, 4]
+    assert [frame["index"] for frame in evaluate("rendering", lost, "folder", moved)["frames"]] == [
+        1,
+        4,
+    ]
 
 
 def test_rendering_leaves_out_frames_that_cannot_be_used(results, recording, capsys, tmp_path):
     spoiled = shutil.copytree(recording, tmp_path / "spoiled")
     (spoiled / "depth" / "1.png").write_bytes(b"no image")
     (spoiled / "poses" / "2.txt").write_text("nan " * 16)
-    arguments = ["evaluate", "rendering", str(results), "folder", str(spoiled), "--start", "0", "--end", "5", "--json"]
+    arguments = [
+        "evaluate",
+        "rendering",
+        str(results),
+        "folder",
+        str(spoiled),
+        "--start",
+        "0",
+        "--end",
+        "5",
+        "--json",
+    ]
     assert cli.main(arguments) == 0
     captured = capsys.readouterr()
     assert [frame["index"] for frame in json.loads(captured.out)["frames"]] == [4]
@@ -242,7 +339,10 @@ def test_rendering_leaves_out_frames_that_cannot_be_used(results, recording, cap
 def test_rendering_table(results, capsys):
     assert cli.main(["evaluate", "rendering", str(results), "--depth-max", "2.5"]) == 0
     out = capsys.readouterr().out
-    assert out.splitlines()[0].split("  ")[0] == "depth L1 cm" and "none of which the run has used; colour from the map" in out
+    assert (
+        out.splitlines()[0].split("  ")[0] == "depth L1 cm"
+        and "none of which the run has used; colour from the map" in out
+    )
 
 
 # --- Runs whose poses were tracked --------------------------------------------------------------------------------------
@@ -255,7 +355,9 @@ def test_a_tracked_run_is_fitted_to_the_recording(results, truth, evaluate, tmp_
     (folder / "metrics.json").write_text(json.dumps(metrics))
     mesh, path = read_mesh(folder / "mesh.ply"), read_trajectory(folder / "trajectory.txt")
     geometry.transformed(mesh, T).save(folder / "mesh.ply")
-    write_trajectory(folder / "trajectory.txt", Trajectory(path.timestamps, T @ path.T_world_camera))
+    write_trajectory(
+        folder / "trajectory.txt", Trajectory(path.timestamps, T @ path.T_world_camera)
+    )
     np.testing.assert_allclose(read_run(folder).T_recording_run() @ T, np.eye(4), atol=1e-6)
     there, here = (evaluate("surface", of, truth, "--samples", SAMPLES) for of in (folder, results))
     assert there["accuracy_cm"] == pytest.approx(here["accuracy_cm"], abs=1e-3)
@@ -271,23 +373,39 @@ def test_a_tracked_run_is_fitted_to_the_recording(results, truth, evaluate, tmp_
 
 
 def test_trajectory_of_a_results_folder_and_of_files(results, evaluate, tmp_path):
-    assert evaluate("trajectory", results)["ate_unaligned_cm"]["max"] < 1e-5  # the recording's own poses, to 9 digits
+    # the recording's own poses, to 9 digits
+    assert evaluate("trajectory", results)["ate_unaligned_cm"]["max"] < 1e-5
     estimate = read_trajectory(results / "trajectory.txt")
     poses = estimate.T_world_camera.copy()
     poses[:, :3, 3] += (0, 0, 0.5)
     poses[1, 0, 3] += 0.01
     write_trajectory(tmp_path / "truth.txt", Trajectory(estimate.timestamps + 0.01, poses))
-    for arguments in ((results, tmp_path / "truth.txt"), (results / "trajectory.txt", tmp_path / "truth.txt")):
+    for arguments in (
+        (results, tmp_path / "truth.txt"),
+        (results / "trajectory.txt", tmp_path / "truth.txt"),
+    ):
         found = evaluate("trajectory", *arguments, "--rpe-delta", "2")
-        assert found["ate_unaligned_cm"]["median"] == pytest.approx(50, abs=0.1) and 0 < found["ate_cm"]["rmse"] < 1
+        assert (
+            found["ate_unaligned_cm"]["median"] == pytest.approx(50, abs=0.1)
+            and 0 < found["ate_cm"]["rmse"] < 1
+        )
         assert (found["matches"], found["rpe_delta"], found["rpe_unit"]) == (3, 2, "frames")
     assert evaluate("trajectory", tmp_path / "truth.txt", results)["matches"] == 3
 
 
 def test_trajectory_table(results, capsys):
-    assert cli.main(["evaluate", "trajectory", str(results), "--rpe-unit", "metres", "--rpe-delta", "99"]) == 0
+    assert (
+        cli.main(
+            ["evaluate", "trajectory", str(results), "--rpe-unit", "metres", "--rpe-delta", "99"]
+        )
+        == 0
+    )
     out = capsys.readouterr().out
-    assert "ATE, aligned [cm]" in out and "RPE, translation over 99 metres [cm]" in out and "3 of 3 estimated poses" in out
+    assert (
+        "ATE, aligned [cm]" in out
+        and "RPE, translation over 99 metres [cm]" in out
+        and "3 of 3 estimated poses" in out
+    )
 
 
 # --- segmentation ---------------------------------------------------------------------------------------------------
@@ -297,21 +415,46 @@ def test_segmentation_of_every_kind_of_file(evaluate, tmp_path):
     (tmp_path / "given.txt").write_text("# from a network\n1\n2\n\n2.0\n-1\n")
     np.save(tmp_path / "true.npy", np.array([1, 2, 1, 2], np.uint8))
     (tmp_path / "names.txt").write_text("﻿# classes\r\n1 kitchen table\r\n2  lamp\r\n")
-    found = evaluate("segmentation", tmp_path / "given.txt", tmp_path / "true.npy", "--names", tmp_path / "names.txt",
-                     "--unseen", "lamp")
+    found = evaluate(
+        "segmentation",
+        tmp_path / "given.txt",
+        tmp_path / "true.npy",
+        "--names",
+        tmp_path / "names.txt",
+        "--unseen",
+        "lamp",
+    )
     assert found["overall_accuracy"] == 0.5 and found["unlabelled"] == 1
     table, lamp = ((c["name"], c["iou"], c["seen"]) for c in found["classes"])
     assert (table, lamp) == (("kitchen table", 0.5, True), ("lamp", 1 / 3, False))
     assert found["unseen"]["mean_iou"] == pytest.approx(1 / 3)
-    by_label = evaluate("segmentation", tmp_path / "given.txt", tmp_path / "true.npy", "--unseen", "2", "--ignore", "1")
+    by_label = evaluate(
+        "segmentation",
+        tmp_path / "given.txt",
+        tmp_path / "true.npy",
+        "--unseen",
+        "2",
+        "--ignore",
+        "1",
+    )
     assert [c["name"] for c in by_label["classes"]] == ["2"] and by_label["seen"] is None
 
 
 def test_segmentation_carries_labels_between_meshes(evaluate, tmp_path):
-    coarse, fine = rectangle((0, 0), (1, 1), 0.0, steps=4), rectangle((0, 0), (1, 1), 0.01, steps=20)
+    coarse, fine = (
+        rectangle((0, 0), (1, 1), 0.0, steps=4),
+        rectangle((0, 0), (1, 1), 0.01, steps=20),
+    )
     for name, mesh in (("coarse", coarse), ("fine", fine)):
         mesh.with_attribute("class", mesh.vertices[:, 0] > 0.63).save(tmp_path / f"{name}.ply")
-    arguments = ["segmentation", tmp_path / "coarse.ply", tmp_path / "fine.ply", "--attribute", "class", "--max-distance"]
+    arguments = [
+        "segmentation",
+        tmp_path / "coarse.ply",
+        tmp_path / "fine.ply",
+        "--attribute",
+        "class",
+        "--max-distance",
+    ]
     assert evaluate(*arguments, "0.3")["overall_accuracy"] == 1
     assert evaluate(*arguments, "0.05")["unlabelled"] > 0
     same = evaluate("segmentation", tmp_path / "fine.ply", *arguments[2:], "1e-9")
@@ -321,10 +464,25 @@ def test_segmentation_carries_labels_between_meshes(evaluate, tmp_path):
 def test_segmentation_table(capsys, tmp_path):
     for name in ("a.txt", "b.txt"):
         (tmp_path / name).write_text("0\n0\n1\n")
-    assert cli.main(["evaluate", "segmentation", str(tmp_path / "a.txt"), str(tmp_path / "b.txt"), "--unseen", "1"]) == 0
+    assert (
+        cli.main(
+            [
+                "evaluate",
+                "segmentation",
+                str(tmp_path / "a.txt"),
+                str(tmp_path / "b.txt"),
+                "--unseen",
+                "1",
+            ]
+        )
+        == 0
+    )
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split() == ["class", "IoU", "%", "accuracy", "%", "points"]
-    assert [line.split() for line in lines[1:3]] == [["0", "100.0", "100.0", "2"], ["1", "*", "100.0", "100.0", "1"]]
+    assert [line.split() for line in lines[1:3]] == [
+        ["0", "100.0", "100.0", "2"],
+        ["1", "*", "100.0", "100.0", "1"],
+    ]
     assert [line.split()[0] for line in lines[4:8]] == ["mean", "all", "seen", "unseen"]
 
 
@@ -350,41 +508,56 @@ def files(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize(("arguments", "sentence"), [
-    (["surface", "nowhere.ply", "square.ply"], "nowhere.ply: no such file"),
-    (["surface", "square.ply", "nowhere.ply"], "nowhere.ply: no such file"),
-    (["surface", "square.ply"], "give the true mesh too"),
-    (["surface", "empty_folder", "square.ply"], "empty_folder: holds no metrics.json"),
-    (["surface", "text.ply", "square.ply"], "text.ply: not a PLY file"),
-    (["surface", "junk.glb", "square.ply"], "junk.glb: cannot be read as a mesh"),
-    (["surface", "poses.txt", "square.ply"], "poses.txt: meshes are read from .ply"),
-    (["surface", "empty.ply", "square.ply"], "reconstruction: has no triangles"),
-    (["surface", "nan.ply", "square.ply"], "1 of 3 vertices are not finite"),
-    (["surface", "far.ply", "square.ply"], "do not overlap"),
-    (["surface", "square.ply", "square.ply", "--thresholds", "-1"], "thresholds above 0"),
-    (["surface", "square.ply", "square.ply", "--samples", "0"], "samples >= 1"),
-    (["surface", "square.ply", "square.ply", "--seen-by", "empty_folder"], "empty_folder: holds no metrics.json"),
-    (["surface", "square.ply", "square.ply", "--seen-by", "x", "--whole"], "exclude each other"),
-    (["surface", "square.ply", "square.ply", "--out", "square.ply/x.json"], "square.ply: cannot write"),
-    (["rendering", "square.ply"], "give the recording to compare the mesh with"),
-    (["rendering", "square.ply", "folder", "nowhere"], "nowhere: no such file or folder"),
-    (["rendering", "square.ply", "7scene", "nowhere"], "did you mean '7scenes'?"),
-    (["rendering", "square.ply", "synthetic", "--start", "99"], "there is no frame 99"),
-    (["rendering", "square.ply", "synthetic", "--every", "0"], "every >= 1"),
-    (["trajectory", "poses.txt"], "give the true poses too"),
-    (["trajectory", "poses.txt", "nowhere.txt"], "nowhere.txt: no such file"),
-    (["trajectory", "poses.txt", "later.txt"], "0 of 5 estimated poses lie within 0.02 s"),
-    (["trajectory", "nan.txt", "poses.txt"], "nan.txt, line 1: expected 8 finite numbers"),
-    (["trajectory", "square.ply", "poses.txt"], "square.ply"),
-    (["trajectory", "poses.txt", "poses.txt", "--rpe-delta", "0"], "rpe_delta must be a positive number"),
-    (["segmentation", "one.txt", "two.txt"], "1 predicted labels but 2 true ones"),
-    (["segmentation", "one.txt", "nowhere.txt"], "nowhere.txt: no such file"),
-    (["segmentation", "one.txt", "one.txt", "--ignore", "1"], "every true label is ignored"),
-    (["segmentation", "one.txt", "one.txt", "--unseen", "lamp"], "give --names to use names"),
-    (["segmentation", "square.ply", "one.txt"], "no vertex property 'label'"),
-    (["trajectorie"], "surface, rendering, trajectory, segmentation"),
-    ([], "surface, rendering, trajectory, segmentation"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["surface", "nowhere.ply", "square.ply"], "nowhere.ply: no such file"),
+        (["surface", "square.ply", "nowhere.ply"], "nowhere.ply: no such file"),
+        (["surface", "square.ply"], "give the true mesh too"),
+        (["surface", "empty_folder", "square.ply"], "empty_folder: holds no metrics.json"),
+        (["surface", "text.ply", "square.ply"], "text.ply: not a PLY file"),
+        (["surface", "junk.glb", "square.ply"], "junk.glb: cannot be read as a mesh"),
+        (["surface", "poses.txt", "square.ply"], "poses.txt: meshes are read from .ply"),
+        (["surface", "empty.ply", "square.ply"], "reconstruction: has no triangles"),
+        (["surface", "nan.ply", "square.ply"], "1 of 3 vertices are not finite"),
+        (["surface", "far.ply", "square.ply"], "do not overlap"),
+        (["surface", "square.ply", "square.ply", "--thresholds", "-1"], "thresholds above 0"),
+        (["surface", "square.ply", "square.ply", "--samples", "0"], "samples >= 1"),
+        (
+            ["surface", "square.ply", "square.ply", "--seen-by", "empty_folder"],
+            "empty_folder: holds no metrics.json",
+        ),
+        (
+            ["surface", "square.ply", "square.ply", "--seen-by", "x", "--whole"],
+            "exclude each other",
+        ),
+        (
+            ["surface", "square.ply", "square.ply", "--out", "square.ply/x.json"],
+            "square.ply: cannot write",
+        ),
+        (["rendering", "square.ply"], "give the recording to compare the mesh with"),
+        (["rendering", "square.ply", "folder", "nowhere"], "nowhere: no such file or folder"),
+        (["rendering", "square.ply", "7scene", "nowhere"], "did you mean '7scenes'?"),
+        (["rendering", "square.ply", "synthetic", "--start", "99"], "there is no frame 99"),
+        (["rendering", "square.ply", "synthetic", "--every", "0"], "every >= 1"),
+        (["trajectory", "poses.txt"], "give the true poses too"),
+        (["trajectory", "poses.txt", "nowhere.txt"], "nowhere.txt: no such file"),
+        (["trajectory", "poses.txt", "later.txt"], "0 of 5 estimated poses lie within 0.02 s"),
+        (["trajectory", "nan.txt", "poses.txt"], "nan.txt, line 1: expected 8 finite numbers"),
+        (["trajectory", "square.ply", "poses.txt"], "square.ply"),
+        (
+            ["trajectory", "poses.txt", "poses.txt", "--rpe-delta", "0"],
+            "rpe_delta must be a positive number",
+        ),
+        (["segmentation", "one.txt", "two.txt"], "1 predicted labels but 2 true ones"),
+        (["segmentation", "one.txt", "nowhere.txt"], "nowhere.txt: no such file"),
+        (["segmentation", "one.txt", "one.txt", "--ignore", "1"], "every true label is ignored"),
+        (["segmentation", "one.txt", "one.txt", "--unseen", "lamp"], "give --names to use names"),
+        (["segmentation", "square.ply", "one.txt"], "no vertex property 'label'"),
+        (["trajectorie"], "surface, rendering, trajectory, segmentation"),
+        ([], "surface, rendering, trajectory, segmentation"),
+    ],
+)
 def test_bad_input_is_one_sentence_and_exit_code_2(files, told, arguments, sentence):
     assert sentence in told(*arguments)
 
@@ -394,12 +567,18 @@ def test_a_folder_that_is_not_there_is_told(metric, told, tmp_path):
     assert "nope: no such file or folder" in told(metric, tmp_path / "nope")
 
 
-@pytest.mark.parametrize(("arguments", "sentence"), [
-    (["surface", "RESULTS"], "a recording of format 'folder' holds no true surface; give one"),
-    (["rendering", "RESULTS", "--every", "3"], "the run has used every one of these frames"),
-    (["rendering", "RESULTS", "--depth-max", "0.01"], "depth_min < depth_max"),
-    (["rendering", "RESULTS", "--depth-min", "50", "--depth-max", "60"], "none of 2 frames has a depth reading"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["surface", "RESULTS"], "a recording of format 'folder' holds no true surface; give one"),
+        (["rendering", "RESULTS", "--every", "3"], "the run has used every one of these frames"),
+        (["rendering", "RESULTS", "--depth-max", "0.01"], "depth_min < depth_max"),
+        (
+            ["rendering", "RESULTS", "--depth-min", "50", "--depth-max", "60"],
+            "none of 2 frames has a depth reading",
+        ),
+    ],
+)
 def test_results_that_do_not_fit_are_told(results, told, arguments, sentence):
     assert sentence in told(*(results if a == "RESULTS" else a for a in arguments))
 
@@ -416,7 +595,10 @@ def test_a_missing_colour_map_is_said_and_vertex_colours_are_judged(results, cap
     (folder / "maps" / "color.safetensors").unlink()
     assert cli.main(["evaluate", "rendering", str(folder)]) == 0
     captured = capsys.readouterr()
-    assert "color.safetensors: no such file" in captured.err and "colour from the vertices" in captured.out
+    assert (
+        "color.safetensors: no such file" in captured.err
+        and "colour from the vertices" in captured.out
+    )
 
 
 @pytest.mark.parametrize("metric", ["surface", "rendering", "trajectory", "segmentation"])

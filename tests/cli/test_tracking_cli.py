@@ -13,8 +13,8 @@ from tiny_recording import FLAGS
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
-from taichi_unifusion.results.writer import TRACKING_FILES
 from taichi_unifusion.geometry import se3
+from taichi_unifusion.results.writer import TRACKING_FILES
 from taichi_unifusion.types import Trajectory
 
 FEW = ["reconstruct", "synthetic", "--end", "3", *FLAGS]
@@ -25,7 +25,11 @@ def written(out) -> tuple[dict, list[dict], np.ndarray]:
     """Metrics, rows of tracking.csv and poses of a results folder."""
     with open(out / "tracking.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    return json.loads((out / "metrics.json").read_text()), rows, read_trajectory(out / "trajectory.txt").T_world_camera
+    return (
+        json.loads((out / "metrics.json").read_text()),
+        rows,
+        read_trajectory(out / "trajectory.txt").T_world_camera,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +41,14 @@ def found(tmp_path_factory):
 
 def test_frames_alone_give_poses_a_map_and_a_report(found):
     metrics, rows, poses = written(found)
-    assert metrics["tracking"]["mode"] == "rgbd" and metrics["tracking"]["verdicts"] == {"tracked": 3}
-    assert metrics["frames"]["used"] == 3 and metrics["mesh"]["triangles"] > 1000 and "tracking.csv" in metrics["files"]
+    assert metrics["tracking"]["mode"] == "rgbd" and metrics["tracking"]["verdicts"] == {
+        "tracked": 3
+    }
+    assert (
+        metrics["frames"]["used"] == 3
+        and metrics["mesh"]["triangles"] > 1000
+        and "tracking.csv" in metrics["files"]
+    )
     assert [row["verdict"] for row in rows] == ["tracked"] * 3
     truth = SyntheticRoom().T_world_camera[:3]
     ours, theirs = se3.inverse(poses[0]) @ poses, se3.inverse(truth[0]) @ truth
@@ -53,11 +63,17 @@ def test_a_summary_says_how_poses_were_found(capsys, tmp_path):
 
 def test_external_poses_and_a_gap(tmp_path, capsys):
     room = SyntheticRoom()
-    write_trajectory(tmp_path / "slam.txt", Trajectory(np.array([0, 2 / 30]), room.T_world_camera[[0, 2]]))
+    write_trajectory(
+        tmp_path / "slam.txt", Trajectory(np.array([0, 2 / 30]), room.T_world_camera[[0, 2]])
+    )
     arguments = [*FEW, "--tracking", "external", "--trajectory", str(tmp_path / "slam.txt")]
     assert cli.main([*arguments, "--out", str(tmp_path / "plain")]) == 0
     metrics, rows, _ = written(tmp_path / "plain")
-    assert metrics["frames"]["used"] == 2 and metrics["tracking"]["gaps"] == ["1"] and rows[1]["verdict"] == "no pose"
+    assert (
+        metrics["frames"]["used"] == 2
+        and metrics["tracking"]["gaps"] == ["1"]
+        and rows[1]["verdict"] == "no pose"
+    )
     assert "1 of 3 frames are not mapped (no pose): 1" in capsys.readouterr().err
     assert cli.main([*arguments, "--interpolate", "--out", str(tmp_path / "filled")]) == 0
     metrics, rows, _ = written(tmp_path / "filled")
@@ -68,7 +84,10 @@ def test_every_thins_the_map_and_not_the_tracking(tmp_path):
     assert cli.main([*FEW, "--every", "2", "--tracking", "rgbd", "--out", str(tmp_path)]) == 0
     metrics, rows, mapped = written(tmp_path)
     assert len(rows) == 3 and metrics["frames"]["used"] == len(mapped) == 2
-    np.testing.assert_allclose(read_trajectory(tmp_path / "tracking.txt").T_world_camera[::2], mapped)  # all poses are kept
+    # all poses are kept
+    np.testing.assert_allclose(
+        read_trajectory(tmp_path / "tracking.txt").T_world_camera[::2], mapped
+    )
 
 
 def test_results_of_tracking_do_not_outlive_it(found, tmp_path):
@@ -79,20 +98,44 @@ def test_results_of_tracking_do_not_outlive_it(found, tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["given", "internal"])
-def test_S2_a_recording_without_poses_is_one_sentence_that_says_what_is_missing(mode, tmp_path, capsys):
+def test_S2_a_recording_without_poses_is_one_sentence_that_says_what_is_missing(
+    mode, tmp_path, capsys
+):
     folder = write_replica(tmp_path / "office", make_samples(2))
     (folder / "traj.txt").unlink()
-    assert cli.main(["reconstruct", "replica", str(folder), "--tracking", mode, "--out", str(tmp_path / "out")]) == 2
+    assert (
+        cli.main(
+            [
+                "reconstruct",
+                "replica",
+                str(folder),
+                "--tracking",
+                mode,
+                "--out",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 2
+    )
     said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1 and f"{folder / 'traj.txt'}: no such file" in said[0] and "--tracking rgbd" in said[0]
+    assert (
+        len(said) == 1
+        and f"{folder / 'traj.txt'}: no such file" in said[0]
+        and "--tracking rgbd" in said[0]
+    )
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("options", "told"), [
-    (["--tracking", "slam"], "rgbd"), (["--tracking", "external"], "external needs a trajectory file"),
-    (["--tracking", "external", "--trajectory", "nowhere.txt"], "nowhere.txt: no such file"),
-    (["--trajectory", "x.txt"], "given reads no trajectory file"), (["--tracking.window", "0"], "window >= 1"),
-])
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--tracking", "slam"], "rgbd"),
+        (["--tracking", "external"], "external needs a trajectory file"),
+        (["--tracking", "external", "--trajectory", "nowhere.txt"], "nowhere.txt: no such file"),
+        (["--trajectory", "x.txt"], "given reads no trajectory file"),
+        (["--tracking.window", "0"], "window >= 1"),
+    ],
+)
 def test_V4_options_that_make_no_sense(options, told, tmp_path, capsys):
     assert cli.main([*FEW, *options, "--out", str(tmp_path / "out")]) == 2
     assert told in " ".join(capsys.readouterr().err.replace("│", " ").split())

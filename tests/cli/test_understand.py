@@ -17,11 +17,13 @@ from taichi_unifusion.results.writer import write_results
 
 COLORS = np.eye(3)  # names are directions of colour here: what is red is "red"
 NAMES = ("red", "green", "blue")
-FOUND = 0.8         # share of the clearly red vertices that must be found
+FOUND = 0.8  # share of the clearly red vertices that must be found
 
 
 class ColorFeatures:
-    """Image features that anybody can check: which of three colours a block of 4 x 4 pixels leans to."""
+    """Image features that anybody can check: which of three colours a block of 4 x 4 pixels leans
+    to.
+    """
 
     name = "colors"
 
@@ -48,20 +50,45 @@ def recording(frames, tmp_path_factory):
     folder = write_folder(tmp_path_factory.mktemp("data") / "recording", frames)
     (folder / "clip").mkdir()
     for i, frame in enumerate(frames):
-        np.save(folder / "clip" / f"{i}.npy", ColorFeatures().image_features(frame).astype(np.float16))
+        np.save(
+            folder / "clip" / f"{i}.npy", ColorFeatures().image_features(frame).astype(np.float16)
+        )
     return folder
 
 
 @pytest.fixture(scope="module")
 def made(recording, tmp_path_factory):
     out = tmp_path_factory.mktemp("results") / "made"
-    assert cli.main(["understand", "folder", str(recording), *FLAGS, "--features", f"folder:{recording / 'clip'}",
-                     "--out", str(out)]) == 0
+    assert (
+        cli.main(
+            [
+                "understand",
+                "folder",
+                str(recording),
+                *FLAGS,
+                "--features",
+                f"folder:{recording / 'clip'}",
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     return out
 
 
 def ask(made, embeddings, *more) -> int:
-    return cli.main([*more[:1], str(made), *more[1:], "--text", f"embeddings:{embeddings}", "--device", FLAGS[1]])
+    return cli.main(
+        [
+            *more[:1],
+            str(made),
+            *more[1:],
+            "--text",
+            f"embeddings:{embeddings}",
+            "--device",
+            FLAGS[1],
+        ]
+    )
 
 
 def lean(mesh):
@@ -91,7 +118,9 @@ def test_a_query_finds_what_is_there_and_says_what_is_not(made, embeddings, caps
     assert (made / "query-red.png").stat().st_size > 1000 and (made / "query.json").exists()
     low, high = np.array(answer["regions"][0]["box"])
     assert (high > low).all() and (low >= mesh.vertices.min(axis=0) - 1e-3).all()
-    assert ask(made, embeddings, "query", "blue", "--negative", "red", "--threshold", "0.99999") == 0
+    assert (
+        ask(made, embeddings, "query", "blue", "--negative", "red", "--threshold", "0.99999") == 0
+    )
     assert "blue: not here" in capsys.readouterr().out
 
 
@@ -102,12 +131,23 @@ def test_segmentation_names_every_vertex_and_measures_itself(made, embeddings, t
     clear = np.sort(colors, axis=1)[:, 2] > 0.3 + np.sort(colors, axis=1)[:, 1]
     truth = mesh.with_attribute("label", np.where(clear, 7 + colors.argmax(axis=1), -1))
     truth.save(tmp_path / "truth.ply")
-    arguments = ("segment", "--labels", str(tmp_path / "labels.txt"), "--truth", str(tmp_path / "truth.ply"))
+    arguments = (
+        "segment",
+        "--labels",
+        str(tmp_path / "labels.txt"),
+        "--truth",
+        str(tmp_path / "truth.ply"),
+    )
     assert ask(made, embeddings, *arguments, "--json") == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["scores"]["overall_accuracy"] > 0.9 and summary["scores"]["points"] == clear.sum()
+    assert (
+        summary["scores"]["overall_accuracy"] > 0.9 and summary["scores"]["points"] == clear.sum()
+    )
     found = read_mesh(made / "segmentation.ply").attributes["label"][:, 0]
-    assert set(np.unique(found)) <= {-1, 7, 8, 9} and (found[clear] == 7 + colors.argmax(axis=1)[clear]).mean() > 0.9
+    assert (
+        set(np.unique(found)) <= {-1, 7, 8, 9}
+        and (found[clear] == 7 + colors.argmax(axis=1)[clear]).mean() > 0.9
+    )
     assert (made / "segmentation.png").exists()
     assert ask(made, embeddings, *arguments) == 0
     out = capsys.readouterr().out
@@ -115,7 +155,21 @@ def test_segmentation_names_every_vertex_and_measures_itself(made, embeddings, t
 
 
 def test_a_finer_mesh_is_still_extracted_beside_features(made, tmp_path):
-    assert cli.main(["mesh", str(made), "--resolution", "2", "--out", str(tmp_path / "a.ply"), "--device", FLAGS[1]]) == 0
+    assert (
+        cli.main(
+            [
+                "mesh",
+                str(made),
+                "--resolution",
+                "2",
+                "--out",
+                str(tmp_path / "a.ply"),
+                "--device",
+                FLAGS[1],
+            ]
+        )
+        == 0
+    )
     assert cli.main(["info", str(made)]) == 0
 
 
@@ -124,14 +178,44 @@ def test_wrong_questions_end_with_one_sentence(made, embeddings, tmp_path, capfd
     np.savez(tmp_path / "wide.npz", names=NAMES, vectors=np.eye(3, 5))
     wide = f"embeddings:{tmp_path / 'wide.npz'}"
     for arguments, message in (
-            (["query", str(made), "red"], "give the text encoder"),
-            (["query", str(tmp_path / "none"), "red", "--text", f"embeddings:{embeddings}"], "no maps/features.safetensors"),
-            (["query", str(made), "mauve", "--text", f"embeddings:{embeddings}"], "has no vector for 'mauve'"),
-            (["query", str(made), "red", "--text", wide], "3 channels"),
-            (["query", str(made), "red", "--text", "letters:x"], "clip, onnx, embeddings"),
-            (["segment", str(made), "--labels", str(tmp_path / "labels.txt"), "--text", f"embeddings:{embeddings}"], "twice"),
-            (["segment", str(made), "--labels", str(tmp_path / "none"), "--text", f"embeddings:{embeddings}"], "no such file"),
-            (["understand", "synthetic", "--features", "klip:x", "--out", str(tmp_path / "o")], "clip, onnx, folder")):
+        (["query", str(made), "red"], "give the text encoder"),
+        (
+            ["query", str(tmp_path / "none"), "red", "--text", f"embeddings:{embeddings}"],
+            "no maps/features.safetensors",
+        ),
+        (
+            ["query", str(made), "mauve", "--text", f"embeddings:{embeddings}"],
+            "has no vector for 'mauve'",
+        ),
+        (["query", str(made), "red", "--text", wide], "3 channels"),
+        (["query", str(made), "red", "--text", "letters:x"], "clip, onnx, embeddings"),
+        (
+            [
+                "segment",
+                str(made),
+                "--labels",
+                str(tmp_path / "labels.txt"),
+                "--text",
+                f"embeddings:{embeddings}",
+            ],
+            "twice",
+        ),
+        (
+            [
+                "segment",
+                str(made),
+                "--labels",
+                str(tmp_path / "none"),
+                "--text",
+                f"embeddings:{embeddings}",
+            ],
+            "no such file",
+        ),
+        (
+            ["understand", "synthetic", "--features", "klip:x", "--out", str(tmp_path / "o")],
+            "clip, onnx, folder",
+        ),
+    ):
         assert cli.main(arguments) == 2
         error = capfd.readouterr().err
         assert message in error and "Traceback" not in error
@@ -146,8 +230,9 @@ def test_frames_without_features_still_give_their_surface(frames, tmp_path):
 
     pipeline = Pipeline(CONFIG, encoder=Sometimes())
     run = pipeline.run(frames)
-    assert [("features" in step.integrations, "features" in step.lacking) for step in run.steps] == [
-        (False, True), (True, False), (False, True)]
+    assert [
+        ("features" in step.integrations, "features" in step.lacking) for step in run.steps
+    ] == [(False, True), (True, False), (False, True)]
     assert len(pipeline.features) > 0 and not run.skipped
 
     class Never(ColorFeatures):
@@ -158,5 +243,8 @@ def test_frames_without_features_still_give_their_surface(frames, tmp_path):
     (tmp_path / "maps").mkdir()
     (tmp_path / "maps" / "features.safetensors").write_text("of an earlier run")
     results = write_results(tmp_path, pipeline, pipeline.run(frames[:1]))
-    assert any("no map of features" in str(error) for error in results.failures) and (tmp_path / "mesh.ply").exists()
+    assert (
+        any("no map of features" in str(error) for error in results.failures)
+        and (tmp_path / "mesh.ply").exists()
+    )
     assert not (tmp_path / "maps" / "features.safetensors").exists()

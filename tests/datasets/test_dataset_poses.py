@@ -1,4 +1,6 @@
-"""Trajectories: bad poses cost one frame and are said; text in every dialect; association by time stamp."""
+"""Trajectories: bad poses cost one frame and are said; text in every dialect; association by time
+stamp.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +8,28 @@ import shutil
 
 import numpy as np
 import pytest
-from dataset_writers import (CAMERA, START, make_pose, make_samples, matrix_text, numbers, quaternion, tum_row, write_folder,
-                             write_replica, write_scannet, write_scannet_flat, write_sens, write_seven_scenes, write_tum)
+from dataset_writers import (
+    CAMERA,
+    START,
+    make_pose,
+    make_samples,
+    matrix_text,
+    numbers,
+    quaternion,
+    tum_row,
+    write_folder,
+    write_replica,
+    write_scannet,
+    write_scannet_flat,
+    write_sens,
+    write_seven_scenes,
+    write_tum,
+)
 
 from taichi_unifusion.datasets import open_dataset
-from taichi_unifusion.geometry.time_stamps import associate, nearest
-from taichi_unifusion.files.poses import rotation_from_quaternion
 from taichi_unifusion.errors import DatasetError, FrameError, InputError, PoseError
+from taichi_unifusion.files.poses import rotation_from_quaternion
+from taichi_unifusion.geometry.time_stamps import associate, nearest
 
 EXACT = 1e-12  # double arithmetic on numbers near one
 
@@ -25,15 +42,18 @@ def scene(tmp_path):
     return write_seven_scenes(tmp_path, make_samples(3))
 
 
-@pytest.mark.parametrize("text, said", [
-    (matrix_text(np.full((4, 4), np.nan)), "NaN or infinite"),
-    (matrix_text(np.full((4, 4), -np.inf)), "NaN or infinite"),
-    (matrix_text(np.zeros((4, 4))), "last row"),
-    (matrix_text(make_pose(1)[:3]), "expected a 4x4 matrix, found 12 numbers"),
-    (matrix_text(make_pose(1).T), "transposed"),
-    ("-1.#INF " * 16, "not a pose file"),
-    ("", "found 0 numbers"),
-])
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        (matrix_text(np.full((4, 4), np.nan)), "NaN or infinite"),
+        (matrix_text(np.full((4, 4), -np.inf)), "NaN or infinite"),
+        (matrix_text(np.zeros((4, 4))), "last row"),
+        (matrix_text(make_pose(1)[:3]), "expected a 4x4 matrix, found 12 numbers"),
+        (matrix_text(make_pose(1).T), "transposed"),
+        ("-1.#INF " * 16, "not a pose file"),
+        ("", "found 0 numbers"),
+    ],
+)
 def test_P1_a_bad_pose_costs_its_frame_and_names_the_file(scene, text, said):
     (scene / "frame-000001.pose.txt").write_text(text)
     dataset = open_dataset("7scenes", scene)
@@ -43,9 +63,14 @@ def test_P1_a_bad_pose_costs_its_frame_and_names_the_file(scene, text, said):
     assert dataset[0].T_world_camera is not None and dataset[2].T_world_camera is not None
 
 
-@pytest.mark.parametrize("T, said", [(make_pose(1) @ np.diag([1.0, 1, -1, 1]), "det R = -1.0000"),
-                                     (make_pose(1) @ np.diag([1.3, 1.3, 1.3, 1]), "det R = 2.1970"),
-                                     (make_pose(1) @ SHEAR, "max |R^T R - I| = 0.2000")])
+@pytest.mark.parametrize(
+    "T, said",
+    [
+        (make_pose(1) @ np.diag([1.0, 1, -1, 1]), "det R = -1.0000"),
+        (make_pose(1) @ np.diag([1.3, 1.3, 1.3, 1]), "det R = 2.1970"),
+        (make_pose(1) @ SHEAR, "max |R^T R - I| = 0.2000"),
+    ],
+)
 def test_P2_what_is_no_rotation_is_refused_with_numbers(scene, T, said):
     (scene / "frame-000001.pose.txt").write_text(matrix_text(T))
     with pytest.raises(PoseError, match="not a rotation") as caught:
@@ -58,7 +83,8 @@ def test_P1_scannet_lost_tracking(tmp_path, write):
     samples = make_samples(3)
     samples[1].T_world_camera[:] = -np.inf
     dataset = open_dataset("scannet", write(tmp_path, samples))
-    assert len(dataset.warnings) == 1 and "1 of 3 frames have no usable pose" in dataset.warnings[0]  # and no jump to it
+    # and no jump to it
+    assert len(dataset.warnings) == 1 and "1 of 3 frames have no usable pose" in dataset.warnings[0]
     with pytest.raises(PoseError, match="NaN or infinite"):
         dataset[1]
     assert dataset[2].depth.any()
@@ -79,7 +105,10 @@ def test_P3_repeated_identity_is_said(tmp_path):
         sample.T_world_camera[:] = np.eye(4)
     samples[1].T_world_camera[:3, 3] = samples[5].T_world_camera[:3, 3] = 0.1
     dataset = open_dataset("7scenes", write_seven_scenes(tmp_path, samples))
-    assert any("3 of 6 frames have exactly the identity" in said and "frame-000002" in said for said in dataset.warnings)
+    assert any(
+        "3 of 6 frames have exactly the identity" in said and "frame-000002" in said
+        for said in dataset.warnings
+    )
 
 
 def test_P8_jump_is_said(tmp_path):
@@ -93,12 +122,18 @@ def test_P8_jump_is_said(tmp_path):
 def test_P6_quaternion_is_normalised_within_tolerance_only(tmp_path):
     samples = make_samples(3)
     folder = write_tum(tmp_path, samples)
-    rows = [f"{s.timestamp:.6f} {numbers(s.T_world_camera[:3, 3])} {numbers(factor * quaternion(s.T_world_camera[:3, :3]))}"
-            for s, factor in zip(samples, (1.0005, 1.3, 0.0), strict=True)]
+    rows = [
+        f"{s.timestamp:.6f} {numbers(s.T_world_camera[:3, 3])} {numbers(factor * quaternion(s.T_world_camera[:3, :3]))}"
+        for s, factor in zip(samples, (1.0005, 1.3, 0.0), strict=True)
+    ]
     (folder / "groundtruth.txt").write_text("\n".join(rows))
     dataset = open_dataset("tum", folder, camera=CAMERA)
-    np.testing.assert_allclose(dataset[0].T_world_camera, samples[0].T_world_camera, rtol=0, atol=EXACT)
-    with pytest.raises(PoseError, match="groundtruth.txt line 2: the quaternion's length is 1.3000"):
+    np.testing.assert_allclose(
+        dataset[0].T_world_camera, samples[0].T_world_camera, rtol=0, atol=EXACT
+    )
+    with pytest.raises(
+        PoseError, match="groundtruth.txt line 2: the quaternion's length is 1.3000"
+    ):
         dataset[1]
     with pytest.raises(PoseError, match="length is 0.0000"):
         dataset[2]
@@ -138,17 +173,22 @@ def test_P7_a_stamp_that_appears_again_is_left_out_and_said(tmp_path):
     dataset = open_dataset("tum", folder, camera=CAMERA)
     assert len(dataset) == 3
     np.testing.assert_array_equal(dataset[1].depth, samples[1].metres(5000.0))
-    assert any("depth.txt line 5" in warning and "appears again" in warning for warning in dataset.warnings)
+    assert any(
+        "depth.txt line 5" in warning and "appears again" in warning for warning in dataset.warnings
+    )
 
 
-@pytest.mark.parametrize("name, line, said", [
-    ("groundtruth.txt", "1305031453.2 1 2 3 0 0 1", "line 6: expected 8 columns .* found 7"),
-    ("groundtruth.txt", "1305031453.2 1 2 3 0 0 0 one", "line 6: 'one' is not a number"),
-    ("groundtruth.txt", "later 1 2 3 0 0 0 1", "line 6: 'later' is not a time stamp"),
-    ("groundtruth.txt", "nan 1 2 3 0 0 0 1", "line 6: 'nan' is not a time stamp"),
-    ("rgb.txt", "1305031453.2", "line 6: expected 'timestamp filename'"),
-    ("depth.txt", "soon depth/x.png", "line 6: expected 'timestamp filename'"),
-])
+@pytest.mark.parametrize(
+    "name, line, said",
+    [
+        ("groundtruth.txt", "1305031453.2 1 2 3 0 0 1", "line 6: expected 8 columns .* found 7"),
+        ("groundtruth.txt", "1305031453.2 1 2 3 0 0 0 one", "line 6: 'one' is not a number"),
+        ("groundtruth.txt", "later 1 2 3 0 0 0 1", "line 6: 'later' is not a time stamp"),
+        ("groundtruth.txt", "nan 1 2 3 0 0 0 1", "line 6: 'nan' is not a time stamp"),
+        ("rgb.txt", "1305031453.2", "line 6: expected 'timestamp filename'"),
+        ("depth.txt", "soon depth/x.png", "line 6: expected 'timestamp filename'"),
+    ],
+)
 def test_P7_a_row_that_cannot_be_read_is_named(tmp_path, name, line, said):
     folder = write_tum(tmp_path, make_samples(4))
     with open(folder / name, "a") as file:
@@ -161,7 +201,9 @@ def test_P7_a_file_name_that_cannot_be_costs_its_frame(tmp_path):
     folder = write_tum(tmp_path, make_samples(3))
     lines = (folder / "depth.txt").read_text().splitlines()
     for wrong in ("nul\0.png", "long" * 100, "nowhere.png"):
-        (folder / "depth.txt").write_text("\n".join([lines[0], f"{lines[1].split()[0]} {wrong}", *lines[2:]]))
+        (folder / "depth.txt").write_text(
+            "\n".join([lines[0], f"{lines[1].split()[0]} {wrong}", *lines[2:]])
+        )
         dataset = open_dataset("tum", folder, camera=CAMERA)
         with pytest.raises(FrameError, match="cannot be read|no such file"):
             dataset[0]
@@ -197,7 +239,9 @@ def test_S1_missing_images_cost_their_frame_only(scene):
 def test_S2_fewer_poses_than_frames_are_said_and_cost_the_rest(tmp_path):
     samples = make_samples(4)
     folder = write_replica(tmp_path, samples)
-    (folder / "traj.txt").write_text("\n".join(numbers(sample.T_world_camera) for sample in samples[:3]))
+    (folder / "traj.txt").write_text(
+        "\n".join(numbers(sample.T_world_camera) for sample in samples[:3])
+    )
     dataset = open_dataset("replica", folder)
     assert any("1 of 4 frames have no usable pose" in warning for warning in dataset.warnings)
     assert dataset[2].depth.any()
@@ -210,16 +254,24 @@ def test_S2_more_poses_than_frames_are_said(tmp_path):
     with open(folder / "traj.txt", "a") as file:
         file.write(numbers(make_pose(2)) + "\n")
     dataset = open_dataset("replica", folder)
-    assert len(dataset) == 2 and any("3 poses but the last frame is number 1" in warning for warning in dataset.warnings)
+    assert len(dataset) == 2 and any(
+        "3 poses but the last frame is number 1" in warning for warning in dataset.warnings
+    )
 
 
 def test_S2_a_missing_pose_file_costs_its_frame(tmp_path):
-    for name, write, file in (("7scenes", write_seven_scenes, "frame-000001.pose.txt"),
-                              ("folder", write_folder, "poses/000001.txt"), ("scannet", write_scannet, "pose/1.txt")):
+    for name, write, file in (
+        ("7scenes", write_seven_scenes, "frame-000001.pose.txt"),
+        ("folder", write_folder, "poses/000001.txt"),
+        ("scannet", write_scannet, "pose/1.txt"),
+    ):
         folder = write(tmp_path / name, make_samples(3))
         (folder / file).unlink()
         dataset = open_dataset(name, folder)
-        assert any("1 of 3 frames have no usable pose" in warning and file in warning for warning in dataset.warnings)
+        assert any(
+            "1 of 3 frames have no usable pose" in warning and file in warning
+            for warning in dataset.warnings
+        )
         with pytest.raises(PoseError, match=f"{file}: no such file"):
             dataset[1]
 
@@ -237,7 +289,9 @@ def test_S2_folder_named_rows_may_be_fewer(tmp_path):
     folder = write_folder(tmp_path, samples, poses="none")
     (folder / "poses.txt").write_text(tum_row(samples[2].T_world_camera, "000002"))
     dataset = open_dataset("folder", folder)
-    np.testing.assert_allclose(dataset[2].T_world_camera, samples[2].T_world_camera, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(
+        dataset[2].T_world_camera, samples[2].T_world_camera, rtol=0, atol=EXACT
+    )
     with pytest.raises(PoseError, match="frame 000001: no row for it"):
         dataset[1]
 
@@ -261,7 +315,9 @@ def test_S3_images_without_partner_are_left_out_and_said(tmp_path):
     (folder / "rgb.txt").write_text("\n".join(lines[:2] + lines[3:]))
     dataset = open_dataset("tum", folder, camera=CAMERA)
     assert len(dataset) == 3
-    assert any("0 colour and 1 depth images have no partner" in warning for warning in dataset.warnings)
+    assert any(
+        "0 colour and 1 depth images have no partner" in warning for warning in dataset.warnings
+    )
     np.testing.assert_array_equal(dataset[1].depth, samples[2].metres(5000.0))
 
 
@@ -279,11 +335,20 @@ def test_S3_max_difference_must_be_usable(tmp_path, gap):
         open_dataset("tum", folder, camera=CAMERA, max_difference=gap)
 
 
-@pytest.mark.parametrize(("format", "write", "poses", "camera"), [
-    ("replica", write_replica, "traj.txt", None), ("7scenes", write_seven_scenes, "frame-*.pose.txt", None),
-    ("scannet", write_scannet, "pose", None), ("scannet", write_scannet_flat, "frame-*.pose.txt", None),
-    ("tum", write_tum, "groundtruth.txt", CAMERA), ("folder", write_folder, "poses", None)])
-def test_S2_without_any_pose_the_frames_are_there_and_what_is_missing_is_said(format, write, poses, camera, tmp_path):
+@pytest.mark.parametrize(
+    ("format", "write", "poses", "camera"),
+    [
+        ("replica", write_replica, "traj.txt", None),
+        ("7scenes", write_seven_scenes, "frame-*.pose.txt", None),
+        ("scannet", write_scannet, "pose", None),
+        ("scannet", write_scannet_flat, "frame-*.pose.txt", None),
+        ("tum", write_tum, "groundtruth.txt", CAMERA),
+        ("folder", write_folder, "poses", None),
+    ],
+)
+def test_S2_without_any_pose_the_frames_are_there_and_what_is_missing_is_said(
+    format, write, poses, camera, tmp_path
+):
     folder = write(tmp_path / "recording", make_samples(2))
     for path in folder.glob(poses):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -291,7 +356,8 @@ def test_S2_without_any_pose_the_frames_are_there_and_what_is_missing_is_said(fo
     assert [frame.T_world_camera for frame in dataset] == [None, None]
     assert poses.replace("*", "XXXXXX") in dataset.no_poses and str(folder) in dataset[:1].no_poses
     assert sum("the frames have no poses" in warning for warning in dataset.warnings) == 1
-    assert not any("pose" in warning for warning in dataset.without_poses().warnings)  # nobody asked for them
+    # nobody asked for them
+    assert not any("pose" in warning for warning in dataset.without_poses().warnings)
 
 
 def test_replica_images_without_a_trajectory_beside_their_camera(tmp_path):
@@ -304,7 +370,12 @@ def test_replica_images_without_a_trajectory_beside_their_camera(tmp_path):
 def brute_force(a, b, max_difference):
     """All pairs within reach, nearest first, each stamp once."""
     pairs, used_a, used_b = [], set(), set()
-    for _, i, j in sorted((abs(x - y), i, j) for i, x in enumerate(a) for j, y in enumerate(b) if abs(x - y) <= max_difference):
+    for _, i, j in sorted(
+        (abs(x - y), i, j)
+        for i, x in enumerate(a)
+        for j, y in enumerate(b)
+        if abs(x - y) <= max_difference
+    ):
         if i not in used_a and j not in used_b:
             pairs.append((i, j))
             used_a.add(i)
@@ -323,20 +394,28 @@ def test_association_equals_trying_all_pairs(seed):
 
 def test_association_takes_the_earlier_of_two_equally_near_and_the_limit_itself():
     a = np.arange(200) / 32  # exact in binary, as are all differences
-    b = a + 1 / 64          # every inner stamp has two partners equally near
+    b = a + 1 / 64  # every inner stamp has two partners equally near
     pairs = associate(a, b, 1 / 64)
-    assert [tuple(pair) for pair in pairs] == brute_force(a, b, 1 / 64) == [(i, i) for i in range(200)]
-    assert len(associate(a[:1], a[:1] + 0.25, 0.25)) == len(associate(a[:1], a[:1] - 0.25, 0.25)) == 1
+    assert (
+        [tuple(pair) for pair in pairs] == brute_force(a, b, 1 / 64) == [(i, i) for i in range(200)]
+    )
+    assert (
+        len(associate(a[:1], a[:1] + 0.25, 0.25)) == len(associate(a[:1], a[:1] - 0.25, 0.25)) == 1
+    )
 
 
 def test_association_is_symmetric():
     rng = np.random.default_rng(9)
     a, b = np.sort(rng.uniform(0, 2, 60)), np.sort(rng.uniform(0, 2, 50))
-    assert sorted(map(tuple, associate(a, b, 0.03))) == sorted((i, j) for j, i in associate(b, a, 0.03))
+    assert sorted(map(tuple, associate(a, b, 0.03))) == sorted(
+        (i, j) for j, i in associate(b, a, 0.03)
+    )
 
 
 def test_nearest_equals_trying_all():
     rng = np.random.default_rng(4)
     for count in (1, 2, 30):
         stamps, query = np.sort(rng.uniform(0, 1, count)), rng.uniform(-0.5, 1.5, 40)
-        np.testing.assert_array_equal(nearest(stamps, query), np.abs(stamps - query[:, None]).argmin(axis=1))
+        np.testing.assert_array_equal(
+            nearest(stamps, query), np.abs(stamps - query[:, None]).argmin(axis=1)
+        )

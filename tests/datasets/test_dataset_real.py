@@ -10,7 +10,9 @@ import pytest
 
 from taichi_unifusion.datasets import open_dataset
 
-DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+DATA = Path(
+    os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")
+)
 
 
 def recording(name: str) -> Path:
@@ -46,18 +48,31 @@ def test_tum_desk():
     assert 0.05 < np.linalg.norm(path[-1] - path[0]) < 0.2  # [m] the hand-held camera moved
 
 
-@pytest.mark.parametrize("name, format, tolerance", [("tum-fr1desk9", "tum", 0.02), ("replica-office0", "replica", 0.01),
-                                                     ("7scenes-redkitchen", "7scenes", 0.05)])
+@pytest.mark.parametrize(
+    "name, format, tolerance",
+    [
+        ("tum-fr1desk9", "tum", 0.02),
+        ("replica-office0", "replica", 0.01),
+        ("7scenes-redkitchen", "7scenes", 0.05),
+    ],
+)
 def test_consecutive_frames_agree_in_the_world(name, format, tolerance):
-    """Depth scale, axes and pose convention together: one frame's points, seen by the next camera, lie at its depth."""
+    """Depth scale, axes and pose convention together: one frame's points, seen by the next camera,
+    lie at its depth.
+    """
     dataset = open_dataset(format, recording(name))
     first, second = dataset[0], dataset[1]
     camera = first.camera
     v, u = np.nonzero(first.depth)
     z = first.depth[v, u]
-    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z, np.ones_like(z)])
+    points = np.stack(
+        [(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z, np.ones_like(z)]
+    )
     x, y, z, _ = np.linalg.inv(second.T_world_camera) @ first.T_world_camera @ points
-    u, v = np.rint(camera.fx * x / z + camera.cx).astype(int), np.rint(camera.fy * y / z + camera.cy).astype(int)
+    u, v = (
+        np.rint(camera.fx * x / z + camera.cx).astype(int),
+        np.rint(camera.fy * y / z + camera.cy).astype(int),
+    )
     inside = (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
     seen = second.depth[v[inside], u[inside]]
     error = np.abs(seen - z[inside])[seen > 0]

@@ -20,6 +20,7 @@ def container(tmp_path):
     def write(data: bytes):
         (tmp_path / "scan.sens").write_bytes(data)
         return tmp_path / "scan.sens"
+
     return write
 
 
@@ -27,28 +28,37 @@ def container(tmp_path):
 @pytest.mark.parametrize("depth_compression", [0, 1])
 def test_every_encoding_loads_the_same(container, color_compression, depth_compression):
     samples = make_samples(3)
-    dataset = open_dataset("scannet", container(sens_bytes(samples, color_compression=color_compression,
-                                                           depth_compression=depth_compression)))
+    dataset = open_dataset(
+        "scannet",
+        container(
+            sens_bytes(
+                samples, color_compression=color_compression, depth_compression=depth_compression
+            )
+        ),
+    )
     assert dataset.camera == CAMERA
     for frame, sample in zip(dataset, samples, strict=True):
         np.testing.assert_array_equal(frame.color, sample.color)
         np.testing.assert_array_equal(frame.depth, sample.metres(1000.0))
 
 
-@pytest.mark.parametrize("lie, said", [
-    ({"frame_count": 1 << 40}, "promises 1099511627776 frames"),
-    ({"frame_count": (1 << 64) - 1}, "promises 18446744073709551615 frames"),  # -1
-    ({"name_bytes": 1 << 60}, "name would have"),
-    ({"size": (0xFFFFFFFF, 12)}, "depth of 4294967295x12"),  # -1
-    ({"size": (65000, 65000)}, "depth of 65000x65000"),
-    ({"size": (0, 12)}, "depth of 0x12"),
-    ({"color_bytes": (1 << 64) - 1}, "frame 0: damaged record"),
-    ({"depth_bytes": 1 << 50}, "frame 0: damaged record"),
-    ({"version": 3}, "version 3"),
-    ({"color_compression": 9}, "colour compression 9 is unknown"),
-    ({"depth_compression": 2}, "Occipital"),
-    ({"depth_compression": -1}, "depth compression -1 is unknown"),
-])
+@pytest.mark.parametrize(
+    "lie, said",
+    [
+        ({"frame_count": 1 << 40}, "promises 1099511627776 frames"),
+        ({"frame_count": (1 << 64) - 1}, "promises 18446744073709551615 frames"),  # -1
+        ({"name_bytes": 1 << 60}, "name would have"),
+        ({"size": (0xFFFFFFFF, 12)}, "depth of 4294967295x12"),  # -1
+        ({"size": (65000, 65000)}, "depth of 65000x65000"),
+        ({"size": (0, 12)}, "depth of 0x12"),
+        ({"color_bytes": (1 << 64) - 1}, "frame 0: damaged record"),
+        ({"depth_bytes": 1 << 50}, "frame 0: damaged record"),
+        ({"version": 3}, "version 3"),
+        ({"color_compression": 9}, "colour compression 9 is unknown"),
+        ({"depth_compression": 2}, "Occipital"),
+        ({"depth_compression": -1}, "depth compression -1 is unknown"),
+    ],
+)
 def test_I2_lies_are_refused_before_anything_is_allocated(container, lie, said):
     options = dict(lie)
     if {"color_compression", "depth_compression"} & set(lie):  # samples cannot be written that way
@@ -67,7 +77,7 @@ def test_I2_lies_are_refused_before_anything_is_allocated(container, lie, said):
 def test_I2_a_cut_file_keeps_the_frames_before_the_cut(container):
     samples = make_samples(4)
     data = sens_bytes(samples)
-    dataset = open_dataset("scannet", container(data[:int(len(data) * 0.7)]))
+    dataset = open_dataset("scannet", container(data[: int(len(data) * 0.7)]))
     assert 0 < len(dataset) < 4
     assert any(f"ends within frame {len(dataset)} of 4" in warning for warning in dataset.warnings)
     np.testing.assert_array_equal(dataset[-1].depth, samples[len(dataset) - 1].metres(1000.0))
@@ -87,7 +97,9 @@ def test_I2_damaged_bytes_never_escape_as_another_error(container):
     data, rng, outcomes = sens_bytes(make_samples(2)), np.random.default_rng(0), set()
     for _ in range(DAMAGES):
         damaged = bytearray(data)
-        damaged[rng.integers(400) if rng.random() < 0.5 else rng.integers(len(data))] = rng.integers(256)
+        damaged[rng.integers(400) if rng.random() < 0.5 else rng.integers(len(data))] = (
+            rng.integers(256)
+        )
         try:
             frame = open_dataset("scannet", container(bytes(damaged)))[0]
             outcomes.add("loaded")
@@ -100,11 +112,16 @@ def test_I2_damaged_bytes_never_escape_as_another_error(container):
 
 def test_I2_depth_is_never_inflated_beyond_the_image(container):
     small = make_samples(1)[0]
-    zeros = type(small)(small.color, np.zeros((4096, 1024), np.uint16), small.T_world_camera, small.timestamp)  # 8 MB in 8 kB
+    # 8 MB in 8 kB
+    zeros = type(small)(
+        small.color, np.zeros((4096, 1024), np.uint16), small.T_world_camera, small.timestamp
+    )
     dataset = open_dataset("scannet", container(sens_bytes([zeros])))
     tracemalloc.start()
     try:
-        with pytest.raises(FrameError, match=f"frame 0 depth: {WIDTH}x{HEIGHT} pixels need 384 bytes, found more"):
+        with pytest.raises(
+            FrameError, match=f"frame 0 depth: {WIDTH}x{HEIGHT} pixels need 384 bytes, found more"
+        ):
             dataset[0]
         assert tracemalloc.get_traced_memory()[1] < REFUSED_COST
     finally:

@@ -1,4 +1,6 @@
-"""Every format written small and loaded back exactly: pixels, metres, poses; and what all data sets have in common."""
+"""Every format written small and loaded back exactly: pixels, metres, poses; and what all data sets
+have in common.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +8,29 @@ from functools import partial
 
 import numpy as np
 import pytest
-from dataset_writers import (CAMERA, CAMERA_YAML, enlarged, make_samples, numbers, tum_row, write_folder, write_image,
-                             write_replica, write_scannet, write_scannet_flat, write_sens, write_seven_scenes, write_tum)
+from dataset_writers import (
+    CAMERA,
+    CAMERA_YAML,
+    enlarged,
+    make_samples,
+    numbers,
+    tum_row,
+    write_folder,
+    write_image,
+    write_replica,
+    write_scannet,
+    write_scannet_flat,
+    write_sens,
+    write_seven_scenes,
+    write_tum,
+)
 
 from taichi_unifusion.datasets import FORMATS, open_dataset
 from taichi_unifusion.types import PinholeCamera
 
-TEXT_POSE = 1e-12       # poses written with all digits; quaternions cost a few roundings
-FLOAT32_POSE = 1e-6     # .sens keeps 32-bit poses
-JPEG_CONSTANT = 2       # [grey levels] a constant colour through JPEG
+TEXT_POSE = 1e-12  # poses written with all digits; quaternions cost a few roundings
+FLOAT32_POSE = 1e-6  # .sens keeps 32-bit poses
+JPEG_CONSTANT = 2  # [grey levels] a constant colour through JPEG
 
 ROUND_TRIPS = {  # name -> format, writer, options, units a metre, pose tolerance
     "7scenes": ("7scenes", write_seven_scenes, {}, 1000.0, TEXT_POSE),
@@ -35,11 +51,17 @@ ROUND_TRIPS = {  # name -> format, writer, options, units a metre, pose toleranc
 def recording(request, tmp_path):
     name, write, options, scale, tolerance = ROUND_TRIPS[request.param]
     samples = make_samples()
-    return open_dataset(name, write(tmp_path / "scene", samples), **options), samples, scale, tolerance
+    return (
+        open_dataset(name, write(tmp_path / "scene", samples), **options),
+        samples,
+        scale,
+        tolerance,
+    )
 
 
 def test_every_file_format_is_under_test():
-    assert {row[0] for row in ROUND_TRIPS.values()} == set(FORMATS) - {"synthetic", "scene", "k4a"}  # rendered; test_k4a.py
+    # rendered; test_k4a.py
+    assert {row[0] for row in ROUND_TRIPS.values()} == set(FORMATS) - {"synthetic", "scene", "k4a"}
 
 
 def test_round_trip_is_exact(recording):
@@ -50,7 +72,9 @@ def test_round_trip_is_exact(recording):
         assert frame.depth.dtype == np.float32 and frame.color.dtype == np.uint8
         np.testing.assert_array_equal(frame.depth, sample.metres(scale))
         np.testing.assert_array_equal(frame.color, sample.color)
-        np.testing.assert_allclose(frame.T_world_camera, sample.T_world_camera, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(
+            frame.T_world_camera, sample.T_world_camera, rtol=0, atol=tolerance
+        )
         assert frame.camera == CAMERA
         assert frame.index == i
 
@@ -76,7 +100,8 @@ def test_common_options_reach_every_format(recording, tmp_path, request):
     frame = open_dataset(name, tmp_path / "scene", depth_scale=2 * scale, camera=camera)[0]
     assert frame.camera == camera
     if request.node.callspec.params["recording"] == "folder-npy":
-        np.testing.assert_array_equal(frame.depth, samples[0].metres(scale))  # floats are metres, whatever the scale
+        # floats are metres, whatever the scale
+        np.testing.assert_array_equal(frame.depth, samples[0].metres(scale))
     else:
         np.testing.assert_array_equal(frame.depth, samples[0].metres(2 * scale))
 
@@ -85,12 +110,15 @@ def test_time_stamps_where_the_format_has_them(tmp_path):
     samples = make_samples()
     for name, write in (("tum", write_tum), ("scannet", write_sens)):
         dataset = open_dataset(name, write(tmp_path / name, samples), camera=CAMERA)
-        assert [frame.timestamp for frame in dataset] == pytest.approx([s.timestamp for s in samples], abs=1e-6)
+        assert [frame.timestamp for frame in dataset] == pytest.approx(
+            [s.timestamp for s in samples], abs=1e-6
+        )
 
 
 def test_seven_scenes_scene_folder_with_one_sequence_and_jpeg(tmp_path):
     folder = write_seven_scenes(tmp_path / "heads" / "seq-01", make_samples(1))
-    (folder / "camera-intrinsics.txt").rename(tmp_path / "heads" / "camera-intrinsics.txt")  # as 3DMatch has it
+    # as 3DMatch has it
+    (folder / "camera-intrinsics.txt").rename(tmp_path / "heads" / "camera-intrinsics.txt")
     (folder / "frame-000000.color.png").unlink()
     write_image(folder / "frame-000000.color.jpg", np.full((12, 16, 3), (200, 100, 50), np.uint8))
     frame = open_dataset("7scenes", tmp_path / "heads")[0]
@@ -102,7 +130,9 @@ def test_seven_scenes_own_intrinsics_without_a_file(tmp_path):
     folder = write_seven_scenes(tmp_path, make_samples(1))
     (folder / "camera-intrinsics.txt").unlink()
     write_image(folder / "frame-000000.depth.png", np.full((480, 640), 1000, np.uint16))
-    assert open_dataset("7scenes", folder).camera == PinholeCamera(640, 480, 585.0, 585.0, 320.0, 240.0)
+    assert open_dataset("7scenes", folder).camera == PinholeCamera(
+        640, 480, 585.0, 585.0, 320.0, 240.0
+    )
 
 
 def test_replica_row_belongs_to_the_frame_number(tmp_path):
@@ -111,7 +141,8 @@ def test_replica_row_belongs_to_the_frame_number(tmp_path):
     for i in (0, 1, 2, 4):
         for name in ("frame", "depth"):
             (folder / "results" / f"{name}{i:06d}.png").unlink()
-    dataset = open_dataset("replica", folder / "results")  # the folder of the images is accepted too
+    # the folder of the images is accepted too
+    dataset = open_dataset("replica", folder / "results")
     assert len(dataset) == 2
     np.testing.assert_array_equal(dataset[0].T_world_camera, samples[3].T_world_camera)
     np.testing.assert_array_equal(dataset[1].T_world_camera, samples[5].T_world_camera)
@@ -119,7 +150,8 @@ def test_replica_row_belongs_to_the_frame_number(tmp_path):
 
 def test_replica_usual_camera_without_a_file(tmp_path):
     folder = write_replica(tmp_path / "Replica" / "office0", make_samples(1))
-    (folder / "cam_params.json").rename(folder.parent / "cam_params.json")  # as the rendered release has it
+    # as the rendered release has it
+    (folder / "cam_params.json").rename(folder.parent / "cam_params.json")
     assert open_dataset("replica", folder).camera == CAMERA
     (folder.parent / "cam_params.json").unlink()
     write_image(folder / "results" / "depth000000.png", np.full((680, 1200), 6553, np.uint16))
@@ -128,10 +160,15 @@ def test_replica_usual_camera_without_a_file(tmp_path):
     assert dataset.depth_scale == 6553.5
 
 
-@pytest.mark.parametrize("name, focal, said", [("rgbd_dataset_freiburg1_desk", 517.3, "freiburg1"),
-                                               ("rgbd_dataset_freiburg2_xyz", 520.9, "freiburg2"),
-                                               ("rgbd_dataset_freiburg3_office", 535.4, "freiburg3"),
-                                               ("my_fridge1", 525.0, "ROS default")])
+@pytest.mark.parametrize(
+    "name, focal, said",
+    [
+        ("rgbd_dataset_freiburg1_desk", 517.3, "freiburg1"),
+        ("rgbd_dataset_freiburg2_xyz", 520.9, "freiburg2"),
+        ("rgbd_dataset_freiburg3_office", 535.4, "freiburg3"),
+        ("my_fridge1", 525.0, "ROS default"),
+    ],
+)
 def test_tum_says_which_intrinsics_it_assumed(tmp_path, name, focal, said):
     folder = write_tum(tmp_path / name, make_samples(1))
     for file in (folder / "depth").iterdir():
@@ -153,7 +190,9 @@ def test_folder_without_colour_and_poses(tmp_path):
 def test_folder_settings_are_used(tmp_path):
     samples = make_samples(1)
     folder = write_folder(tmp_path, samples, poses="none")
-    (folder / "camera.yaml").write_text(CAMERA_YAML + "depth_scale: 5e3\ndepth_invalid: [0, 7]\nposes: vicon.txt\n")
+    (folder / "camera.yaml").write_text(
+        CAMERA_YAML + "depth_scale: 5e3\ndepth_invalid: [0, 7]\nposes: vicon.txt\n"
+    )
     (folder / "vicon.txt").write_text(numbers(samples[0].T_world_camera))
     units = np.full((12, 16), 10000, np.uint16)
     units[3, 4] = 7
@@ -172,7 +211,9 @@ def test_folder_poses_by_time_stamp(tmp_path):
     rows = [tum_row(sample.T_world_camera, f"{sample.timestamp + 0.003:.4f}") for sample in samples]
     (folder / "poses.txt").write_text("# time tx ty tz qx qy qz qw\n" + "\n".join(reversed(rows)))
     for frame, sample in zip(open_dataset("folder", folder), samples, strict=True):
-        np.testing.assert_allclose(frame.T_world_camera, sample.T_world_camera, rtol=0, atol=TEXT_POSE)
+        np.testing.assert_allclose(
+            frame.T_world_camera, sample.T_world_camera, rtol=0, atol=TEXT_POSE
+        )
         assert frame.timestamp == pytest.approx(sample.timestamp, abs=1e-6)
 
 
@@ -180,8 +221,11 @@ def test_folder_counts_like_people(tmp_path):
     samples = make_samples(11)
     (tmp_path / "camera.yaml").write_text(CAMERA_YAML)
     for i, sample in enumerate(samples):
-        write_image(tmp_path / "depth" / f"shot{i}.png", sample.units)  # shot10 follows shot9, not shot1
-    (tmp_path / "poses.txt").write_text("\n".join(numbers(sample.T_world_camera) for sample in samples))
+        # shot10 follows shot9, not shot1
+        write_image(tmp_path / "depth" / f"shot{i}.png", sample.units)
+    (tmp_path / "poses.txt").write_text(
+        "\n".join(numbers(sample.T_world_camera) for sample in samples)
+    )
     dataset = open_dataset("folder", tmp_path)
     np.testing.assert_array_equal(dataset[10].depth, samples[10].metres(1000.0))
     np.testing.assert_array_equal(dataset[2].T_world_camera, samples[2].T_world_camera)

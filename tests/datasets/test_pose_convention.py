@@ -24,11 +24,15 @@ def test_right_poses_are_left_alone(pair):
     assert has_moved(*pair) and guess_pose_convention(*pair) == (True, None)
 
 
-@pytest.mark.parametrize("change, words", [
-    (np.linalg.inv, "on .*% if they are world-to-camera matrices: invert them"),
-    (lambda T: T @ FLIP_YZ, "OpenGL's axes .*multiply"),
-    (lambda T: np.linalg.inv(T @ FLIP_YZ), "world-to-camera matrices with OpenGL's axes"),
-], ids=["P4", "P5", "P4 and P5"])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (np.linalg.inv, "on .*% if they are world-to-camera matrices: invert them"),
+        (lambda T: T @ FLIP_YZ, "OpenGL's axes .*multiply"),
+        (lambda T: np.linalg.inv(T @ FLIP_YZ), "world-to-camera matrices with OpenGL's axes"),
+    ],
+    ids=["P4", "P5", "P4 and P5"],
+)
 def test_P4_P5_other_conventions_are_named(pair, change, words):
     decided, sentence = guess_pose_convention(*posed(pair, change))
     assert decided
@@ -39,7 +43,10 @@ def test_frames_that_share_nothing_decide_nothing(pair):
     away = np.eye(4)
     away[:3, 3] = 50
     a, b = pair
-    assert guess_pose_convention(a, replace(b, T_world_camera=away @ b.T_world_camera)) == (False, None)
+    assert guess_pose_convention(a, replace(b, T_world_camera=away @ b.T_world_camera)) == (
+        False,
+        None,
+    )
 
 
 def test_a_camera_that_stands_still_decides_nothing(pair):

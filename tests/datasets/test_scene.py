@@ -1,4 +1,6 @@
-"""Frames rendered from a textured scene: depth, colour and objects against ray casting, a Kinect's noise, bad files."""
+"""Frames rendered from a textured scene: depth, colour and objects against ray casting, a Kinect's
+noise, bad files.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +11,18 @@ import reference_scene as reference
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.scene import SceneDataset, kinect_camera
 from taichi_unifusion.datasets.synthetic import look_at
-from taichi_unifusion.rendering.textured_scene import load_scene, mip_levels
 from taichi_unifusion.errors import DatasetError, InputError, PoseError
 from taichi_unifusion.files.trajectories import write_trajectory
+from taichi_unifusion.rendering.textured_scene import load_scene, mip_levels
 from taichi_unifusion.types import PinholeCamera, Trajectory
 
 trimesh = pytest.importorskip("trimesh")
 Image = pytest.importorskip("PIL.Image")
 
-DEPTH_TOLERANCE = 2e-7    # relative: depth is float64 until it is stored as float32
-COSINE_TOLERANCE = 1e-5   # float32 throughout
-COLOR_TOLERANCE = 1.5     # of 255: float32 texture coordinates on steep texels, and rounding
-EDGE_BAND = 1e-4          # barycentric: nearer to an edge either triangle may win
+DEPTH_TOLERANCE = 2e-7  # relative: depth is float64 until it is stored as float32
+COSINE_TOLERANCE = 1e-5  # float32 throughout
+COLOR_TOLERANCE = 1.5  # of 255: float32 texture coordinates on steep texels, and rounding
+EDGE_BAND = 1e-4  # barycentric: nearer to an edge either triangle may win
 CAMERA = PinholeCamera(64, 48, 56.0, 56.0, 31.5, 23.5)
 POSE = look_at((0.5, -2.6, 1.1), (0.1, 0.0, 0.1))
 
@@ -33,32 +35,52 @@ def checkers(height: int = 48, width: int = 64, square: int = 8) -> np.ndarray:
 
 
 def quad(low, high, square: int = 8) -> trimesh.Trimesh:
-    """A textured rectangle at y = 0 that faces -y, texture upright: its first row at the top (z = high)."""
+    """A textured rectangle at y = 0 that faces -y, texture upright: its first row at the top (z =
+    high).
+    """
     (x0, z0), (x1, z1) = low, high
     vertices = [(x0, 0, z0), (x1, 0, z0), (x1, 0, z1), (x0, 0, z1)]
-    return trimesh.Trimesh(vertices, [(0, 1, 2), (0, 2, 3)], process=False,
-                           visual=textured([(0, 0), (1, 0), (1, 1), (0, 1)], square))
+    return trimesh.Trimesh(
+        vertices,
+        [(0, 1, 2), (0, 2, 3)],
+        process=False,
+        visual=textured([(0, 0), (1, 0), (1, 1), (0, 1)], square),
+    )
 
 
 def textured(uv, square: int = 8):
     """Texture coordinates (v up, as trimesh has them) on the checkerboard."""
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(checkers(square=square)))
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(checkers(square=square))
+    )
     return trimesh.visual.TextureVisuals(uv=np.array(uv, float), material=material)
 
 
 def box_scene() -> trimesh.Scene:
-    """A turned box with the texture repeated on every side, a floor coloured at its corners, and a plain grey roof edge on."""
+    """A turned box with the texture repeated on every side, a floor coloured at its corners, and a
+    plain grey roof edge on.
+    """
     scene = trimesh.Scene()
     box = trimesh.creation.box((0.8, 0.6, 0.9))
     box.unmerge_vertices()
     uv = np.tile([(0, 0), (1.7, 0), (1.7, 1.3)], (12, 1))
     turn = trimesh.transformations.rotation_matrix(0.5, (0.2, 0.1, 1))
-    scene.add_geometry(trimesh.Trimesh(box.vertices, box.faces, process=False, visual=textured(uv)), node_name="box",
-                       geom_name="box", transform=turn)
-    floor = trimesh.Trimesh([(-2, -2, -0.6), (2, -2, -0.6), (2, 2, -0.6), (-2, 2, -0.6)], [(0, 1, 2), (0, 2, 3)], process=False,
-                            vertex_colors=[(255, 0, 0, 255), (0, 255, 0, 255), (0, 0, 255, 255), (90, 90, 90, 255)])
+    scene.add_geometry(
+        trimesh.Trimesh(box.vertices, box.faces, process=False, visual=textured(uv)),
+        node_name="box",
+        geom_name="box",
+        transform=turn,
+    )
+    floor = trimesh.Trimesh(
+        [(-2, -2, -0.6), (2, -2, -0.6), (2, 2, -0.6), (-2, 2, -0.6)],
+        [(0, 1, 2), (0, 2, 3)],
+        process=False,
+        vertex_colors=[(255, 0, 0, 255), (0, 255, 0, 255), (0, 0, 255, 255), (90, 90, 90, 255)],
+    )
     scene.add_geometry(floor, node_name="floor", geom_name="floor")
-    roof = trimesh.Trimesh([(0.4, -0.4, 0.7), (0.9, 0.4, 0.75), (0.4, 0.5, 0.6)], [(0, 1, 2)], process=False)
+    roof = trimesh.Trimesh(
+        [(0.4, -0.4, 0.7), (0.9, 0.4, 0.75), (0.4, 0.5, 0.6)], [(0, 1, 2)], process=False
+    )
     scene.add_geometry(roof, node_name="roof", geom_name="roof")
     return scene
 
@@ -77,16 +99,24 @@ def scene(path):
 
 @pytest.fixture(scope="module")
 def trajectory():
-    return Trajectory(np.arange(3) / 30, np.stack([look_at((0.5 + 0.1 * i, -2.6, 1.1), (0.1, 0.0, 0.1)) for i in range(3)]))
+    return Trajectory(
+        np.arange(3) / 30,
+        np.stack([look_at((0.5 + 0.1 * i, -2.6, 1.1), (0.1, 0.0, 0.1)) for i in range(3)]),
+    )
 
 
 def test_file_gives_objects_with_their_places_and_looks(scene):
     assert scene.object_names == ("box", "floor", "roof")
     assert np.bincount(scene.face_object).tolist() == [12, 2, 1]
-    assert len(scene.textures) == 1 and scene.textures[0].shape == (48, 64, 3)  # one picture, kept once
-    assert set(scene.face_texture[scene.face_object == 0]) == {0} and set(scene.face_texture[scene.face_object > 0]) == {-1}
+    # one picture, kept once
+    assert len(scene.textures) == 1 and scene.textures[0].shape == (48, 64, 3)
+    assert set(scene.face_texture[scene.face_object == 0]) == {0} and set(
+        scene.face_texture[scene.face_object > 0]
+    ) == {-1}
     corner = scene.vertices[scene.faces[scene.face_object == 0]].reshape(-1, 3)
-    assert np.linalg.norm(corner, axis=1).max() == pytest.approx(np.linalg.norm((0.4, 0.3, 0.45)), abs=1e-6)
+    assert np.linalg.norm(corner, axis=1).max() == pytest.approx(
+        np.linalg.norm((0.4, 0.3, 0.45)), abs=1e-6
+    )
     assert np.abs(corner[:, 0]).max() > 0.45  # turned
 
 
@@ -118,11 +148,14 @@ def test_texture_is_upright_and_seen_at_its_own_resolution(tmp_path):
     light = view.color.sum() / checkers().sum()
     assert 0.6 < light < 1
     error = np.abs(view.color - light * checkers()).max(axis=2)
-    assert (error < COLOR_TOLERANCE).mean() > 0.97  # pixels on the diagonal are the mean of two places, one in each triangle
+    # pixels on the diagonal are the mean of two places, one in each triangle
+    assert (error < COLOR_TOLERANCE).mean() > 0.97
 
 
 def test_far_and_oblique_textures_are_means_not_noise(tmp_path):
-    """From far off a checkerboard is its mean colour, whatever the direction: mip levels and taps sum to what is there."""
+    """From far off a checkerboard is its mean colour, whatever the direction: mip levels and taps
+    sum to what is there.
+    """
     trimesh.Scene([quad((-4, -3), (4, 3), square=2)]).export(tmp_path / "quad.glb")
     scene = load_scene(tmp_path / "quad.glb")
     camera = PinholeCamera(4, 4, 12.0, 12.0, 1.5, 1.5)
@@ -138,23 +171,31 @@ def test_color_of_a_point_does_not_depend_on_where_from(tmp_path):
     camera = PinholeCamera(1, 1, 2000.0, 2000.0, 0.0, 0.0)
     rng = np.random.default_rng(2)
     for target in rng.uniform((-0.9, 0, -0.6), (0.9, 0, 0.6), (20, 3)):
-        colors = [scene.render(camera, look_at(target + offset, target)).color[0, 0].astype(int)
-                  for offset in ((0.2, -1, 0.1), (-0.4, -0.7, -0.2))]
-        assert np.abs(colors[0] - colors[1]).max() <= 8  # the footprints differ by a fraction of a texel
+        colors = [
+            scene.render(camera, look_at(target + offset, target)).color[0, 0].astype(int)
+            for offset in ((0.2, -1, 0.1), (-0.4, -0.7, -0.2))
+        ]
+        # the footprints differ by a fraction of a texel
+        assert np.abs(colors[0] - colors[1]).max() <= 8
 
 
 def test_both_sides_are_drawn(tmp_path):
     trimesh.Scene([quad((-1, -1), (1, 1))]).export(tmp_path / "quad.glb")
     scene = load_scene(tmp_path / "quad.glb")
     for y in (-1.5, 1.5):
-        np.testing.assert_allclose(scene.render_depth(CAMERA, look_at((0, y, 0), (0, 0, 0)))[20:28, 24:40], 1.5, rtol=1e-6)
+        np.testing.assert_allclose(
+            scene.render_depth(CAMERA, look_at((0, y, 0), (0, 0, 0)))[20:28, 24:40], 1.5, rtol=1e-6
+        )
 
 
 def test_mip_levels_keep_the_mean():
     levels = mip_levels(checkers(64, 64))
     assert [level.shape[0] for level in levels] == [64, 32, 16, 8, 4, 2, 1]
     for level in levels:
-        np.testing.assert_allclose(level.mean(axis=(0, 1)), checkers(64, 64).mean(axis=(0, 1)), atol=2)  # rounded at each level
+        # rounded at each level
+        np.testing.assert_allclose(
+            level.mean(axis=(0, 1)), checkers(64, 64).mean(axis=(0, 1)), atol=2
+        )
     assert mip_levels(checkers(3, 10))[-1].shape == (1, 1, 3)
 
 
@@ -167,13 +208,18 @@ def test_frames_are_pure_functions_of_index_and_seed(path, trajectory):
     other = open_dataset("scene", path, trajectory=trajectory, camera=CAMERA, seed=1)
     _ = again[0]
     assert frames[2].depth.tobytes() == again[2].depth.tobytes() == again[::2][1].depth.tobytes()
-    assert frames[2].color.tobytes() == other[2].color.tobytes() and frames[2].depth.tobytes() != other[2].depth.tobytes()
+    assert (
+        frames[2].color.tobytes() == other[2].color.tobytes()
+        and frames[2].depth.tobytes() != other[2].depth.tobytes()
+    )
     np.testing.assert_array_equal(frames[1].T_world_camera, trajectory.T_world_camera[1])
     assert (frames[1].index, frames[1].timestamp, len(frames)) == (1, 1 / 30, 3)
 
 
 def test_noise_is_a_kinects_and_can_be_left_out(path, trajectory):
-    quiet = open_dataset("scene", path, trajectory=trajectory, camera=kinect_camera(160, 120), noise=False)
+    quiet = open_dataset(
+        "scene", path, trajectory=trajectory, camera=kinect_camera(160, 120), noise=False
+    )
     noisy = open_dataset("scene", path, trajectory=trajectory, camera=kinect_camera(160, 120))
     exact, read = quiet[0].depth, noisy[0].depth
     assert exact.tobytes() == quiet.exact_depth(0).tobytes() == noisy.exact_depth(0).tobytes()
@@ -185,7 +231,9 @@ def test_noise_is_a_kinects_and_can_be_left_out(path, trajectory):
 
 
 def test_what_lies_behind_nothing_is_read_as_nothing(path):
-    """Rays that leave the scene neither give a reading nor hide the projector's light from what is beside them."""
+    """Rays that leave the scene neither give a reading nor hide the projector's light from what is
+    beside them.
+    """
     away = Trajectory(np.zeros(1), look_at((0, 0, 5), (0, 0.1, 9))[None])
     frames = open_dataset("scene", path, trajectory=away, camera=CAMERA)
     assert not frames[0].depth.any() and not frames.exact_depth(0).any()
@@ -195,8 +243,13 @@ def test_what_lies_behind_nothing_is_read_as_nothing(path):
 
 
 def test_labels_name_classes_and_objects(path, trajectory):
-    frames = open_dataset("scene", path, trajectory=trajectory, camera=CAMERA,
-                          classes={"box": "furniture", "roof": "furniture"})
+    frames = open_dataset(
+        "scene",
+        path,
+        trajectory=trajectory,
+        camera=CAMERA,
+        classes={"box": "furniture", "roof": "furniture"},
+    )
     classes, objects = frames.labels(0)
     assert frames.class_names == ("floor", "furniture")
     seen = objects >= 0
@@ -227,8 +280,11 @@ def test_a_scene_needs_a_trajectory_and_poses_that_are_rigid(path, trajectory):
         _ = frames[1]
 
 
-@pytest.mark.parametrize("content", [b"", b"no scene", b"glTF\x02\x00\x00\x00\xff\xff\xff\xff"],
-                         ids=["empty", "text", "cut off"])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"no scene", b"glTF\x02\x00\x00\x00\xff\xff\xff\xff"],
+    ids=["empty", "text", "cut off"],
+)
 def test_a_damaged_file_is_said_to_be_one(content, tmp_path, trajectory):
     bad = tmp_path / "bad.glb"
     bad.write_bytes(content)
@@ -250,7 +306,11 @@ def test_other_file_types_give_the_same_view(scene, tmp_path):
     box.export(tmp_path / "quad.obj")
     trimesh.Scene([box]).export(tmp_path / "quad.glb")
     pose = look_at((0.2, -2, 0.1), (0, 0, 0))
-    np.testing.assert_array_equal(load_scene(tmp_path / "quad.obj").render(CAMERA, pose).color,
-                                  load_scene(tmp_path / "quad.glb").render(CAMERA, pose).color)
-    np.testing.assert_array_equal(load_scene(tmp_path / "floor.ply").colors,
-                                  floor.visual.vertex_colors[:, :3] / np.float32(255))
+    np.testing.assert_array_equal(
+        load_scene(tmp_path / "quad.obj").render(CAMERA, pose).color,
+        load_scene(tmp_path / "quad.glb").render(CAMERA, pose).color,
+    )
+    np.testing.assert_array_equal(
+        load_scene(tmp_path / "floor.ply").colors,
+        floor.visual.vertex_colors[:, :3] / np.float32(255),
+    )

@@ -1,21 +1,25 @@
-"""The synthetic room: exact ground truth, a Kinect's noise as modelled, the same bytes whatever the order."""
+"""The synthetic room: exact ground truth, a Kinect's noise as modelled, the same bytes whatever the
+order.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from taichi_unifusion.rendering.primitives import CHORD_ERROR
 from taichi_unifusion.datasets.synthetic import SyntheticRoom, look_at
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.rendering.kernels.solids import kinect_depth
+from taichi_unifusion.rendering.primitives import CHORD_ERROR
 from taichi_unifusion.runtime import current
 from taichi_unifusion.types import PinholeCamera
 
-MAX_STEP, MAX_TURN = 0.10, 8.0  # [m], [degrees] between frames of the default loop: what frame-to-frame tracking bears
-CASTING_ERROR = 2e-5            # [m] float32 of rays and maps, at grazing incidence and 4 m
-SILHOUETTES = 0.001             # share of rays that pass a curved outline within the chord error, and see different things
-SAMPLING = 0.03                 # relative; five standard errors of the deviation of 19,200 pixels
+# [m], [degrees] between frames of the default loop: what frame-to-frame tracking bears
+MAX_STEP, MAX_TURN = 0.10, 8.0
+CASTING_ERROR = 2e-5  # [m] float32 of rays and maps, at grazing incidence and 4 m
+# share of rays that pass a curved outline within the chord error, and see different things
+SILHOUETTES = 0.001
+SAMPLING = 0.03  # relative; five standard errors of the deviation of 19,200 pixels
 
 
 @pytest.fixture(scope="module")
@@ -32,20 +36,33 @@ def read(exact: np.ndarray, *, degrees: float = 0.0, frame: int = 0, seed: int =
     """The sensor's reading of exact depth [m] on surfaces seen at this angle of incidence."""
     current()
     depth = np.zeros_like(exact)
-    kinect_depth(exact, np.full_like(exact, np.cos(np.radians(degrees))), exact.min(), seed, frame, 575.0, depth)
+    kinect_depth(
+        exact,
+        np.full_like(exact, np.cos(np.radians(degrees))),
+        exact.min(),
+        seed,
+        frame,
+        575.0,
+        depth,
+    )
     return depth
 
 
 def wall(z: float) -> np.ndarray:
-    """A wall about z [m] away, leaning by 10 % of it, so that rounding to millimetres and disparities averages out."""
+    """A wall about z [m] away, leaning by 10 % of it, so that rounding to millimetres and
+    disparities averages out.
+    """
     return np.repeat(np.linspace(0.95 * z, 1.05 * z, 160, dtype=np.float32)[None], 120, axis=0)
 
 
 def cast_mesh(mesh, T_world_camera, rays):
-    """Depth of the nearest triangle along rays with unit z, and whether it faces the camera, in float64 NumPy."""
+    """Depth of the nearest triangle along rays with unit z, and whether it faces the camera, in
+    float64 NumPy.
+    """
     vertices = (mesh.vertices.astype(np.float64) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     a, b, c = (vertices[mesh.faces[:, k]] for k in range(3))
-    front = np.einsum("fi,fi->f", np.cross(b - a, c - a), a)  # negative where the triangle is counter-clockwise to the eye
+    # negative where the triangle is counter-clockwise to the eye
+    front = np.einsum("fi,fi->f", np.cross(b - a, c - a), a)
     sides = [np.cross(b, c), np.cross(c, a), np.cross(a, b)]
     depth, facing = [], []
     for ray in rays:
@@ -65,25 +82,32 @@ def test_exact_depth_is_that_of_the_ground_truth_mesh(room, mesh):
     errors, facing = [], []
     for index in (0, 14, 37, 51):
         u, v = rng.integers(0, camera.width, 25), rng.integers(0, camera.height, 25)
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(25)], axis=1)
+        rays = np.stack(
+            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(25)], axis=1
+        )
         z, front = cast_mesh(mesh, room.T_world_camera[index], rays)
         errors.append(np.abs(room.exact_depth(index)[v, u] - z))
         facing.append(front)
     errors = np.concatenate(errors)
     assert np.median(errors) < CASTING_ERROR  # flat faces are exact in the mesh
-    assert np.sum(errors > 10 * CHORD_ERROR) <= 1  # chords seen at down to 6 degrees; one ray may pass a silhouette
+    # chords seen at down to 6 degrees; one ray may pass a silhouette
+    assert np.sum(errors > 10 * CHORD_ERROR) <= 1
     assert np.concatenate(facing).all()
 
 
 def test_all_of_exact_depth_agrees_with_an_independent_ray_caster(room, mesh):
     o3d = pytest.importorskip("open3d")
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    scene.add_triangles(
+        o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32))
+    )
     K = room.camera.matrix
     K[:2, 2] += 0.5  # Open3D's pixel centres lie at half integers
     for index in (5, 48):
         T_camera_world = np.linalg.inv(room.T_world_camera[index])
-        rays = scene.create_rays_pinhole(o3d.core.Tensor(K), o3d.core.Tensor(T_camera_world), *room.camera.size)
+        rays = scene.create_rays_pinhole(
+            o3d.core.Tensor(K), o3d.core.Tensor(T_camera_world), *room.camera.size
+        )
         error = np.abs(scene.cast_rays(rays)["t_hit"].numpy() - room.exact_depth(index))
         assert np.median(error) < CASTING_ERROR
         assert np.mean(error > 10 * CHORD_ERROR) < SILHOUETTES
@@ -95,7 +119,8 @@ def test_mesh_faces_and_normals_point_into_free_space(mesh):
     area = np.linalg.norm(n, axis=1)
     assert area.min() > 0
     shading = mesh.normals[mesh.faces].mean(axis=1)
-    assert np.einsum("fi,fi->f", n / area[:, None], shading).min() > 0.9  # chords of fine tessellation bend by a few degrees
+    # chords of fine tessellation bend by a few degrees
+    assert np.einsum("fi,fi->f", n / area[:, None], shading).min() > 0.9
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
 
 
@@ -117,7 +142,11 @@ def test_the_seed_changes_the_noise_and_nothing_else():
 
 def test_without_noise_depth_is_exact(room):
     quiet = SyntheticRoom(width=320, height=240, noise=False)
-    assert quiet[11].depth.tobytes() == quiet.exact_depth(11).tobytes() == room.exact_depth(11).tobytes()
+    assert (
+        quiet[11].depth.tobytes()
+        == quiet.exact_depth(11).tobytes()
+        == room.exact_depth(11).tobytes()
+    )
 
 
 @pytest.mark.parametrize("z", (0.8, 1.5, 2.5, 3.5, 4.5))
@@ -132,7 +161,8 @@ def test_noise_grows_with_the_square_of_depth(z):
     assert abs(error.std() - 1) < SAMPLING
     assert abs(error.mean()) < 0.05
     gaps = np.diff(np.unique(reading))
-    assert np.median(gaps) == pytest.approx(np.median(step), abs=0.001 + 0.3 * np.median(step))  # whole millimetres apart
+    # whole millimetres apart
+    assert np.median(gaps) == pytest.approx(np.median(step), abs=0.001 + 0.3 * np.median(step))
 
 
 def test_noise_of_frames_pixels_and_seeds_is_unrelated():
@@ -155,8 +185,12 @@ def test_projector_shadow_lies_left_of_what_stands_in_front():
     depth = read(exact)
     width = int(575 * 0.075 * (1 / near - 1 / far))
     jitter = 4  # [px] beyond the lateral noise
-    assert not depth[:, left - width + jitter:left - jitter].any()
-    for lit in (slice(0, left - width - jitter), slice(left + jitter, 110 - jitter), slice(110 + jitter, None)):
+    assert not depth[:, left - width + jitter : left - jitter].any()
+    for lit in (
+        slice(0, left - width - jitter),
+        slice(left + jitter, 110 - jitter),
+        slice(110 + jitter, None),
+    ):
         assert depth[:, lit].all()
 
 
@@ -174,7 +208,7 @@ def test_readings_are_whole_millimetres_in_range_and_mostly_there(room):
         depth = room[index].depth
         valid = depth > 0
         assert valid.mean() > 0.85
-        assert 0.4 <= depth[valid].min() and depth.max() <= 5.5
+        assert depth[valid].min() >= 0.4 and depth.max() <= 5.5
         np.testing.assert_allclose(depth * 1000, np.round(depth * 1000), atol=1e-3)
 
 
@@ -187,14 +221,23 @@ def test_color_is_that_of_the_surface_point_not_of_the_view(room):
     seen = 0
     for v, u in zip(rng.integers(0, 240, 80), rng.integers(0, 320, 80), strict=True):
         z = depth[v, u]
-        x = T[:3, :3] @ ((u - room.camera.cx) / room.camera.fx * z, (v - room.camera.cy) / room.camera.fy * z, z) + T[:3, 3]
+        x = (
+            T[:3, :3]
+            @ (
+                (u - room.camera.cx) / room.camera.fx * z,
+                (v - room.camera.cy) / room.camera.fy * z,
+                z,
+            )
+            + T[:3, 3]
+        )
         eye = T[:3, 3] + rng.uniform(-0.3, 0.3, 3)
         T_other = look_at(eye, x)
         other_depth, other_hit = scene.cast(camera, T_other)
         if abs(other_depth[0, 0] - np.linalg.norm(x - eye)) > 1e-4:
             continue  # hidden from there
         other, _ = scene.shade(camera, T_other, other_depth, other_hit)
-        assert np.abs(other[0, 0].astype(int) - color[v, u]).max() <= 3  # float32 of the point, against texture gradients
+        # float32 of the point, against texture gradients
+        assert np.abs(other[0, 0].astype(int) - color[v, u]).max() <= 3
         seen += 1
     assert seen > 60
 
@@ -202,7 +245,9 @@ def test_color_is_that_of_the_surface_point_not_of_the_view(room):
 def test_poses_are_rigid_smooth_and_close_the_loop(room):
     T = room.T_world_camera
     R, following = T[:, :3, :3], np.roll(T, -1, axis=0)
-    np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+    np.testing.assert_allclose(
+        R @ R.swapaxes(1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12
+    )
     assert np.linalg.det(R).min() > 0.999
     assert np.linalg.norm(following[:, :3, 3] - T[:, :3, 3], axis=1).max() < MAX_STEP
     turn = np.degrees(np.arccos((np.einsum("nij,nij->n", R, following[:, :3, :3]) - 1) / 2))
@@ -215,7 +260,8 @@ def test_the_camera_passes_everything_and_bumps_into_nothing():
     scene, views = room._scene, 0
     for T in room.T_world_camera:
         depth, hit = scene.cast(room.camera, T)
-        assert depth.min() > 0.5 and depth.max() < 6  # the room is closed, and a Kinect reads from 0.4 m on
+        # the room is closed, and a Kinect reads from 0.4 m on
+        assert depth.min() > 0.5 and depth.max() < 6
         views = views + np.isin(np.arange(len(scene.shapes)), hit)
     assert np.mean(views >= 3) > 0.85  # some legs stand behind others
 

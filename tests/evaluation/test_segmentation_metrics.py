@@ -22,15 +22,30 @@ def test_a_case_by_hand():
     assert (lamp.iou, lamp.accuracy, lamp.seen) == (1 / 2, 1, False)
     assert (result.points, result.ignored, result.unlabelled) == (7, 1, 1)
     assert result.overall_accuracy == pytest.approx(4 / 7)
-    assert result.mean_iou == pytest.approx((1 / 2 + 1 / 3 + 1 / 2) / 3) and result.mean_accuracy == pytest.approx(2 / 3)
+    assert result.mean_iou == pytest.approx(
+        (1 / 2 + 1 / 3 + 1 / 2) / 3
+    ) and result.mean_accuracy == pytest.approx(2 / 3)
     assert (result.seen.classes, result.seen.mean_iou) == (2, pytest.approx(5 / 12))
-    assert (result.unseen.classes, result.unseen.mean_iou, result.unseen.mean_accuracy) == (1, 1 / 2, 1)
+    assert (result.unseen.classes, result.unseen.mean_iou, result.unseen.mean_accuracy) == (
+        1,
+        1 / 2,
+        1,
+    )
 
 
 def test_everything_right_and_everything_wrong():
     truth = np.arange(30) % 3
-    right, wrong = evaluate_segmentation(truth, truth), evaluate_segmentation((truth + 1) % 3, truth)
-    assert (right.mean_iou, right.mean_accuracy, right.overall_accuracy, right.seen, right.unseen) == (1, 1, 1, None, None)
+    right, wrong = (
+        evaluate_segmentation(truth, truth),
+        evaluate_segmentation((truth + 1) % 3, truth),
+    )
+    assert (
+        right.mean_iou,
+        right.mean_accuracy,
+        right.overall_accuracy,
+        right.seen,
+        right.unseen,
+    ) == (1, 1, 1, None, None)
     assert (wrong.mean_iou, wrong.mean_accuracy, wrong.overall_accuracy) == (0, 0, 0)
     assert [score.name for score in right.classes] == ["0", "1", "2"]
 
@@ -38,14 +53,20 @@ def test_everything_right_and_everything_wrong():
 def test_points_to_ignore_play_no_part_whatever_was_given_for_them():
     truth, given = np.array([0, 1, 2, 2, 7]), np.array([0, 1, 2, 1, 1])
     plain = evaluate_segmentation(given[:4], truth[:4])
-    for ignored in (evaluate_segmentation(given, truth, ignore=(7,)),
-                    evaluate_segmentation(given, truth, names={0: "a", 1: "b", 2: "c"})):
+    for ignored in (
+        evaluate_segmentation(given, truth, ignore=(7,)),
+        evaluate_segmentation(given, truth, names={0: "a", 1: "b", 2: "c"}),
+    ):
         assert ignored.ignored == 1 and ignored.mean_iou == plain.mean_iou and ignored.points == 4
 
 
 def test_labels_of_no_true_class_are_missed_points_and_no_classes():
     result = evaluate_segmentation([0, 8, -1, -3], [0, 0, 0, 0])
-    assert result.mean_iou == result.mean_accuracy == 0.25 and len(result.classes) == 1 and result.unlabelled == 1
+    assert (
+        result.mean_iou == result.mean_accuracy == 0.25
+        and len(result.classes) == 1
+        and result.unlabelled == 1
+    )
 
 
 def test_names_of_labels_do_not_matter():
@@ -53,7 +74,10 @@ def test_names_of_labels_do_not_matter():
     truth, given = rng.integers(0, 6, 500), rng.integers(0, 6, 500)
     new = np.array([40, 3, 77, 0, 12, 5])
     here, there = evaluate_segmentation(given, truth), evaluate_segmentation(new[given], new[truth])
-    assert there.mean_iou == pytest.approx(here.mean_iou) and there.overall_accuracy == here.overall_accuracy
+    assert (
+        there.mean_iou == pytest.approx(here.mean_iou)
+        and there.overall_accuracy == here.overall_accuracy
+    )
     assert [s.iou for s in there.classes] == [here.classes[i].iou for i in np.argsort(new)]
 
 
@@ -65,9 +89,15 @@ def test_numbers_are_those_of_counting_one_by_one_and_of_scikit_learn():
         pairs = [(t == score.label, g == score.label) for t, g in zip(truth, given, strict=True)]
         both, either = sum(t and g for t, g in pairs), sum(t or g for t, g in pairs)
         assert score.iou == both / either and score.accuracy == both / sum(t for t, _ in pairs)
-    sklearn = pytest.importorskip("sklearn.metrics", reason="scikit-learn is not installed: pip install scikit-learn")
-    assert result.mean_iou == pytest.approx(sklearn.jaccard_score(truth, given, labels=range(5), average="macro"))
-    assert result.mean_accuracy == pytest.approx(sklearn.recall_score(truth, given, labels=range(5), average="macro"))
+    sklearn = pytest.importorskip(
+        "sklearn.metrics", reason="scikit-learn is not installed: pip install scikit-learn"
+    )
+    assert result.mean_iou == pytest.approx(
+        sklearn.jaccard_score(truth, given, labels=range(5), average="macro")
+    )
+    assert result.mean_accuracy == pytest.approx(
+        sklearn.recall_score(truth, given, labels=range(5), average="macro")
+    )
     assert result.overall_accuracy == pytest.approx(sklearn.accuracy_score(truth, given))
 
 
@@ -76,7 +106,14 @@ def test_numbers_are_those_of_counting_one_by_one_and_of_scikit_learn():
 
 def test_labels_go_to_the_nearest_within_reach():
     points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
-    targets = [(0.04, 0, 0), (0.97, 0.02, 0), (0, 0.95, 0), (0.6, 0.5, 0), (0, 0, 0.0999), (0, 0, 0.1001)]
+    targets = [
+        (0.04, 0, 0),
+        (0.97, 0.02, 0),
+        (0, 0.95, 0),
+        (0.6, 0.5, 0),
+        (0, 0, 0.0999),
+        (0, 0, 0.1001),
+    ]
     assert transfer_labels(points, [3, 4, 5], targets).tolist() == [3, 4, 5, -1, 3, -1]
     assert transfer_labels(points, [3, 4, 5], targets, max_distance=1.0)[3] == 4
 
@@ -94,31 +131,37 @@ def test_labels_may_come_as_a_mesh_carries_them():
 # --- Bad input ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("predicted", "truth", "options", "told"), [
-    ([1, 2], [1, 2, 3], {}, "2 predicted labels but 3 true ones"),
-    ([], [], {}, r"predicted labels must be \(N,\) whole numbers"),
-    ([1.5], [1], {}, "predicted labels hold numbers that are not whole"),
-    ([1], [np.nan], {}, "true labels hold numbers that are not whole"),
-    ([1e300], [1], {}, "not whole"),
-    (["chair"], [1], {}, "whole numbers"),
-    ([[1, 2]], [1], {}, "whole numbers"),
-    ([1, 1], [-1, -1], {}, "no point is left of 2"),
-    ([1], [1], {"names": {}}, "no point is left"),
-    ([1], [1], {"names": NAMES, "unseen": (4,)}, "unseen class 4 is not among the names"),
-    (np.arange(20_000), np.arange(20_000), {}, "20000 different true labels"),
-])
+@pytest.mark.parametrize(
+    ("predicted", "truth", "options", "told"),
+    [
+        ([1, 2], [1, 2, 3], {}, "2 predicted labels but 3 true ones"),
+        ([], [], {}, r"predicted labels must be \(N,\) whole numbers"),
+        ([1.5], [1], {}, "predicted labels hold numbers that are not whole"),
+        ([1], [np.nan], {}, "true labels hold numbers that are not whole"),
+        ([1e300], [1], {}, "not whole"),
+        (["chair"], [1], {}, "whole numbers"),
+        ([[1, 2]], [1], {}, "whole numbers"),
+        ([1, 1], [-1, -1], {}, "no point is left of 2"),
+        ([1], [1], {"names": {}}, "no point is left"),
+        ([1], [1], {"names": NAMES, "unseen": (4,)}, "unseen class 4 is not among the names"),
+        (np.arange(20_000), np.arange(20_000), {}, "20000 different true labels"),
+    ],
+)
 def test_bad_labels_are_told_in_one_sentence(predicted, truth, options, told):
     with pytest.raises(InputError, match=told):
         evaluate_segmentation(predicted, truth, **options)
 
 
-@pytest.mark.parametrize(("points", "labels", "options", "told"), [
-    ([(0, 0, 0)], [1, 2], {}, "1 points but 2 labels"),
-    ([(0, 0, np.nan)], [1], {}, "finite"),
-    (np.empty((0, 3)), [1], {}, "at least one"),
-    ([(0, 0, 0)], [1], {"max_distance": 0.0}, "above 0 m"),
-    ([(0, 0, 0)], [1], {"max_distance": float("nan")}, "above 0 m"),
-])
+@pytest.mark.parametrize(
+    ("points", "labels", "options", "told"),
+    [
+        ([(0, 0, 0)], [1, 2], {}, "1 points but 2 labels"),
+        ([(0, 0, np.nan)], [1], {}, "finite"),
+        (np.empty((0, 3)), [1], {}, "at least one"),
+        ([(0, 0, 0)], [1], {"max_distance": 0.0}, "above 0 m"),
+        ([(0, 0, 0)], [1], {"max_distance": float("nan")}, "above 0 m"),
+    ],
+)
 def test_bad_points_are_told_in_one_sentence(points, labels, options, told):
     with pytest.raises(InputError, match=told):
         transfer_labels(points, labels, [(0, 0, 0)], **options)

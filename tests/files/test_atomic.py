@@ -13,18 +13,23 @@ import pytest
 
 from taichi_unifusion.errors import DatasetError, FileError, PoseError
 from taichi_unifusion.files.atomic import atomic_write, check_writable
-from taichi_unifusion.geometry.quaternions import quaternion_to_rotation, rotation_to_quaternion
 from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
+from taichi_unifusion.geometry.quaternions import quaternion_to_rotation, rotation_to_quaternion
 from taichi_unifusion.types import Trajectory
 
 REPO = Path(__file__).resolve().parents[2]
-POSE_TOLERANCE = 2e-9             # files hold 9 digits
-ROTATION_TOLERANCE = 1e-12        # float64 rounding of a few products
+POSE_TOLERANCE = 2e-9  # files hold 9 digits
+ROTATION_TOLERANCE = 1e-12  # float64 rounding of a few products
 
 
 def run_python(code: str, *arguments: object) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)], cwd=REPO, text=True,
-                          capture_output=True, timeout=60)
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)],
+        cwd=REPO,
+        text=True,
+        capture_output=True,
+        timeout=60,
+    )
 
 
 # Atomic writing
@@ -59,7 +64,10 @@ def test_atomic_write_follows_links_and_spares_what_is_no_file(tmp_path):
     assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "real.txt").read_text() == "new"
     with pytest.raises(FileError, match="not a regular file"), atomic_write(tmp_path):
         pass
-    with pytest.raises(FileError, match="folder does not exist"), atomic_write(tmp_path / "none" / "a") as temporary:
+    with (
+        pytest.raises(FileError, match="folder does not exist"),
+        atomic_write(tmp_path / "none" / "a") as temporary,
+    ):
         temporary.write_text("x")
 
 
@@ -96,7 +104,10 @@ def test_R6_unwritable_folder_is_an_error_and_a_writable_one_is_made(tmp_path):
     assert check_writable(tmp_path / "a" / "b") == tmp_path / "a" / "b"
     assert os.listdir(tmp_path / "a" / "b") == []
     (tmp_path / "file").write_text("")
-    for folder, reason in ((tmp_path / "file" / "out", "is a file, not a folder"), (tmp_path / "file", "stands in the way")):
+    for folder, reason in (
+        (tmp_path / "file" / "out", "is a file, not a folder"),
+        (tmp_path / "file", "stands in the way"),
+    ):
         with pytest.raises(FileError, match=reason):
             check_writable(folder)
     if Path("/proc").is_dir():  # nobody may write there, root included
@@ -129,13 +140,31 @@ def random_rotations(count: int, seed: int = 0) -> np.ndarray:
 
 
 def half_turns() -> np.ndarray:
-    """180 degrees about the axes, the face diagonals and some other axes, where trace-based formulas divide by zero."""
-    axes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, -1], [0, -1, 1], [1, 1, 1], [1, -2, 3], [1e-9, 1, 0]])
+    """180 degrees about the axes, the face diagonals and some other axes, where trace-based
+    formulas divide by zero.
+    """
+    axes = np.array(
+        [
+            [1, 0, 0],
+            [0, 1, 0],
+            [0, 0, 1],
+            [1, 1, 0],
+            [1, 0, -1],
+            [0, -1, 1],
+            [1, 1, 1],
+            [1, -2, 3],
+            [1e-9, 1, 0],
+        ]
+    )
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     return 2 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
 
 
-@pytest.mark.parametrize("R", [random_rotations(200), half_turns(), np.eye(3)[None]], ids=["random", "half turns", "identity"])
+@pytest.mark.parametrize(
+    "R",
+    [random_rotations(200), half_turns(), np.eye(3)[None]],
+    ids=["random", "half turns", "identity"],
+)
 def test_quaternions_round_trip(R):
     q = rotation_to_quaternion(R)
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=ROTATION_TOLERANCE)
@@ -146,7 +175,9 @@ def test_quaternions_round_trip(R):
 def test_quaternion_convention():
     s = np.sqrt(0.5)
     quarter_turn_about_z = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
-    np.testing.assert_allclose(rotation_to_quaternion(quarter_turn_about_z[None]), [[0, 0, s, s]], atol=ROTATION_TOLERANCE)
+    np.testing.assert_allclose(
+        rotation_to_quaternion(quarter_turn_about_z[None]), [[0, 0, s, s]], atol=ROTATION_TOLERANCE
+    )
     unnormalised = quaternion_to_rotation([[0, 0, 2 * s, 2 * s]])
     np.testing.assert_allclose(unnormalised, quarter_turn_about_z[None], atol=ROTATION_TOLERANCE)
 
@@ -164,22 +195,36 @@ def test_trajectory_round_trip(tmp_path):
     read = read_trajectory(tmp_path / "t.txt")
     assert np.array_equal(read.timestamps, trajectory.timestamps)
     np.testing.assert_allclose(read.T_world_camera, trajectory.T_world_camera, atol=POSE_TOLERANCE)
-    assert (tmp_path / "t.txt").read_text().startswith("# timestamp tx ty tz qx qy qz qw\n1305031102.175304 ")
+    assert (
+        (tmp_path / "t.txt")
+        .read_text()
+        .startswith("# timestamp tx ty tz qx qy qz qw\n1305031102.175304 ")
+    )
 
 
 def test_P7_trajectory_comments_bom_crlf_and_order(tmp_path):
-    (tmp_path / "t.txt").write_bytes(b"\xef\xbb\xbf# a comment\r\n\r\n 2.5  1 2 3  0 0 0 1\r\n1.5\t4 5 6 0 0 0 -1.0005\r\n")
+    (tmp_path / "t.txt").write_bytes(
+        b"\xef\xbb\xbf# a comment\r\n\r\n 2.5  1 2 3  0 0 0 1\r\n1.5\t4 5 6 0 0 0 -1.0005\r\n"
+    )
     read = read_trajectory(tmp_path / "t.txt")
     assert read.timestamps.tolist() == [1.5, 2.5]
     np.testing.assert_allclose(read.T_world_camera[:, :3, 3], [[4, 5, 6], [1, 2, 3]])
-    np.testing.assert_allclose(read.T_world_camera[:, :3, :3], np.tile(np.eye(3), (2, 1, 1)), atol=ROTATION_TOLERANCE)
+    np.testing.assert_allclose(
+        read.T_world_camera[:, :3, :3], np.tile(np.eye(3), (2, 1, 1)), atol=ROTATION_TOLERANCE
+    )
 
 
-@pytest.mark.parametrize(("line", "message"), [
-    ("1 2 3", "line 2: expected 8"), ("1 0 0 0 0 0 0 one", "line 2: expected 8 numbers"),
-    ("1 0 0 nan 0 0 0 1", "line 2: .*finite"), ("0 0 0 0 0 0 0 1 9", "line 2: expected 8"),
-    ("1 0 0 0 0 0 0 1.1", "length 1.1"), ("1 0 0 0 0 0 0 0", "length 0.0"),
-])
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 2 3", "line 2: expected 8"),
+        ("1 0 0 0 0 0 0 one", "line 2: expected 8 numbers"),
+        ("1 0 0 nan 0 0 0 1", "line 2: .*finite"),
+        ("0 0 0 0 0 0 0 1 9", "line 2: expected 8"),
+        ("1 0 0 0 0 0 0 1.1", "length 1.1"),
+        ("1 0 0 0 0 0 0 0", "length 0.0"),
+    ],
+)
 def test_P6_P7_bad_trajectory_line_is_named(tmp_path, line, message):
     (tmp_path / "t.txt").write_text(f"0 0 0 0 0 0 0 1\n{line}\n")
     with pytest.raises(DatasetError, match=message):

@@ -1,4 +1,6 @@
-"""Damaged, wrong and hostile image files cost one frame and say which file; depth units and their scale."""
+"""Damaged, wrong and hostile image files cost one frame and say which file; depth units and their
+scale.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +13,22 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from dataset_writers import make_samples, write_folder, write_image, write_replica, write_seven_scenes
+from dataset_writers import (
+    make_samples,
+    write_folder,
+    write_image,
+    write_replica,
+    write_seven_scenes,
+)
 
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.checks import guess_depth_scale
-from taichi_unifusion.files.images import depth_file_size, read_color, read_depth
 from taichi_unifusion.errors import FrameError, InputError, SizeMismatch
+from taichi_unifusion.files.images import depth_file_size, read_color, read_depth
 
-REFUSED_COST = 2 << 20  # [bytes] allocated while refusing a hostile header; its image would take gigabytes
-FLIPS = 200             # single-bit damages tried
+# [bytes] allocated while refusing a hostile header; its image would take gigabytes
+REFUSED_COST = 2 << 20
+FLIPS = 200  # single-bit damages tried
 
 
 @pytest.fixture
@@ -32,13 +41,20 @@ def encoded(suffix: str, image: np.ndarray) -> bytes:
 
 
 def png_header(width: int, height: int) -> bytes:
-    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)), (b"IDAT", zlib.compress(bytes(64))),
-              (b"IEND", b"")]
+    chunks = [
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)),
+        (b"IDAT", zlib.compress(bytes(64))),
+        (b"IEND", b""),
+    ]
     return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks)
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
 
 
-@pytest.mark.parametrize("write, name", [(write_seven_scenes, "7scenes"), (write_replica, "replica")])
+@pytest.mark.parametrize(
+    "write, name", [(write_seven_scenes, "7scenes"), (write_replica, "replica")]
+)
 def test_F5_colour_of_another_size_is_refused_with_both_sizes(tmp_path, write, name):
     folder = write(tmp_path, make_samples(1))
     file = next(file for file in sorted(folder.rglob("*.png")) if "depth" not in file.name)
@@ -56,10 +72,15 @@ def test_F5_folder_resizes_the_same_shape_only(tmp_path):
         open_dataset("folder", folder)[0]
 
 
-@pytest.mark.parametrize("image, said", [(np.zeros((12, 16), np.uint8), "3 channels, got 1"),
-                                         (np.zeros((12, 16, 4), np.uint8), "drop_alpha"),
-                                         (np.zeros((12, 16, 3), np.uint16), "8 bits a channel, got uint16"),
-                                         (np.zeros((12, 16), np.uint16), "is this a depth image")])
+@pytest.mark.parametrize(
+    "image, said",
+    [
+        (np.zeros((12, 16), np.uint8), "3 channels, got 1"),
+        (np.zeros((12, 16, 4), np.uint8), "drop_alpha"),
+        (np.zeros((12, 16, 3), np.uint16), "8 bits a channel, got uint16"),
+        (np.zeros((12, 16), np.uint16), "is this a depth image"),
+    ],
+)
 def test_F6_colour_of_another_kind_is_refused(scene, image, said):
     file = scene / "frame-000001.color.png"
     file.write_bytes(encoded(".png", image))
@@ -77,13 +98,23 @@ def test_F6_alpha_is_dropped_by_option(scene):
 
 def test_F6_coloured_depth_is_refused(scene):
     write_image(scene / "frame-000001.depth.png", np.zeros((12, 16, 3), np.uint16))
-    with pytest.raises(FrameError, match="frame-000001.depth.png: depth must be one channel of 16 bits, got 3"):
+    with pytest.raises(
+        FrameError, match="frame-000001.depth.png: depth must be one channel of 16 bits, got 3"
+    ):
         open_dataset("7scenes", scene)[1]
 
 
 @pytest.mark.parametrize("kind", ["color", "depth"])
-@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: b"not an image at all\n", lambda data: data[:20],
-                                    lambda data: data[:len(data) // 2], lambda data: data[:-13]])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: b"",
+        lambda data: b"not an image at all\n",
+        lambda data: data[:20],
+        lambda data: data[: len(data) // 2],
+        lambda data: data[:-13],
+    ],
+)
 def test_F7_broken_png_costs_its_frame_and_names_the_file(scene, kind, damage):
     file = scene / f"frame-000001.{kind}.png"
     file.write_bytes(damage(file.read_bytes()))
@@ -96,11 +127,15 @@ def test_F7_broken_png_costs_its_frame_and_names_the_file(scene, kind, damage):
 
 @pytest.mark.parametrize("kept", [0.02, 0.3, 0.7, 0.99])
 def test_F7_cut_jpeg_is_never_filled_with_grey(tmp_path, kept):
-    image = cv2.resize(np.random.default_rng(3).integers(0, 256, (12, 16, 3), dtype=np.uint8), (160, 120))
+    image = cv2.resize(
+        np.random.default_rng(3).integers(0, 256, (12, 16, 3), dtype=np.uint8), (160, 120)
+    )
     data = encoded(".jpg", image)
     file = tmp_path / "cut.jpg"
-    file.write_bytes(data[:int(len(data) * kept)])
-    with pytest.raises(FrameError, match="cut.jpg: the (JPEG file is cut off|image header is damaged)"):
+    file.write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(
+        FrameError, match="cut.jpg: the (JPEG file is cut off|image header is damaged)"
+    ):
         read_color(file)
 
 
@@ -109,7 +144,7 @@ def test_F7_every_flipped_bit_of_a_png_is_found(tmp_path):
     data = encoded(".png", rng.integers(0, 65535, (12, 16), dtype=np.uint16))
     for _ in range(FLIPS):
         at, bit = rng.integers(len(data)), rng.integers(8)
-        file.write_bytes(data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1:])
+        file.write_bytes(data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :])
         with pytest.raises(FrameError, match="flipped.png"):
             read_depth(file, 1000.0)
 
@@ -117,9 +152,10 @@ def test_F7_every_flipped_bit_of_a_png_is_found(tmp_path):
 def test_F7_flipped_bits_of_a_jpeg_never_escape_as_another_error(tmp_path):
     rng, file = np.random.default_rng(0), tmp_path / "flipped.jpg"
     data, decoded = encoded(".jpg", rng.integers(0, 256, (12, 16, 3), dtype=np.uint8)), 0
-    for _ in range(FLIPS):  # JPEG has no checksums: what still decodes must at least be a colour image
+    # JPEG has no checksums: what still decodes must at least be a colour image
+    for _ in range(FLIPS):
         at, bit = rng.integers(len(data)), rng.integers(8)
-        file.write_bytes(data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1:])
+        file.write_bytes(data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :])
         try:
             image = read_color(file)
         except FrameError as error:
@@ -135,7 +171,9 @@ def test_F3_65535_and_0_are_no_reading(scene):
     units[2, 2], units[3, 3] = 65535, 0
     write_image(scene / "frame-000000.depth.png", units)
     depth = open_dataset("7scenes", scene)[0].depth
-    assert depth[2, 2] == 0 and depth[3, 3] == 0 and np.count_nonzero(depth == 2.5) == depth.size - 2
+    assert (
+        depth[2, 2] == 0 and depth[3, 3] == 0 and np.count_nonzero(depth == 2.5) == depth.size - 2
+    )
 
 
 def test_F8_sixteen_bits_stay_sixteen(scene):
@@ -180,9 +218,15 @@ def jpeg_header(width: int, height: int) -> bytes:
     return b"\xff\xd8\xff\xc0" + struct.pack(">H", 2 + len(frame)) + frame + scan + b"\xff\xd9"
 
 
-@pytest.mark.parametrize("name, data", [("bomb.png", png_header(65000, 65000)), ("bomb.jpg", jpeg_header(65000, 65000)),
-                                        ("bomb.pgm", b"P5\n65000 65000\n65535\n" + bytes(64)),
-                                        ("flat.png", png_header(0, 480))])
+@pytest.mark.parametrize(
+    "name, data",
+    [
+        ("bomb.png", png_header(65000, 65000)),
+        ("bomb.jpg", jpeg_header(65000, 65000)),
+        ("bomb.pgm", b"P5\n65000 65000\n65535\n" + bytes(64)),
+        ("flat.png", png_header(0, 480)),
+    ],
+)
 def test_F11_header_bombs_are_refused_before_decoding(tmp_path, name, data):
     file = tmp_path / name
     file.write_bytes(data)
@@ -199,7 +243,9 @@ def test_F11_header_bombs_are_refused_before_decoding(tmp_path, name, data):
 
 def npy_header(rows: int) -> bytes:
     file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (rows, 16)})
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": "<f4", "fortran_order": False, "shape": (rows, 16)}
+    )
     return file.getvalue() + bytes(64)
 
 
@@ -208,7 +254,15 @@ def test_F11_npy_headers_are_judged_too(tmp_path):
     file = tmp_path / "bomb.npy"
     np.save(file, np.ones((12, 16), np.float32))
     good = file.read_bytes()
-    for damaged in (npy_header(1 << 40), npy_header(1 << 62), good[:-1], good[:40], b"", b"\x80\x04N.", b"PK\x03\x04"):
+    for damaged in (
+        npy_header(1 << 40),
+        npy_header(1 << 62),
+        good[:-1],
+        good[:40],
+        b"",
+        b"\x80\x04N.",
+        b"PK\x03\x04",
+    ):
         file.write_bytes(damaged)
         with pytest.raises(FrameError, match="bomb.npy"):
             read_depth(file, 1000.0)
@@ -239,9 +293,13 @@ def test_npy_depth_of_every_usual_type(tmp_path):
     metres = np.array([[1.5, 0.0], [np.nan, -np.inf]])
     for dtype in (np.float16, np.float32, np.float64):
         np.save(tmp_path / "depth.npy", metres.astype(dtype))
-        np.testing.assert_array_equal(read_depth(tmp_path / "depth.npy", 1000.0), np.array([[1.5, 0], [0, 0]], np.float32))
+        np.testing.assert_array_equal(
+            read_depth(tmp_path / "depth.npy", 1000.0), np.array([[1.5, 0], [0, 0]], np.float32)
+        )
     np.save(tmp_path / "depth.npy", np.array([[1500, 65535]], np.uint16))
-    np.testing.assert_array_equal(read_depth(tmp_path / "depth.npy", 1000.0), np.array([[1.5, 0]], np.float32))
+    np.testing.assert_array_equal(
+        read_depth(tmp_path / "depth.npy", 1000.0), np.array([[1.5, 0]], np.float32)
+    )
     assert depth_file_size(tmp_path / "depth.npy") == (2, 1)
     np.save(tmp_path / "depth.npy", np.array([[1500, 7]], np.int64))
     with pytest.raises(FrameError, match="16 bits"):

@@ -20,7 +20,7 @@ TENSORS = {
     "features": np.random.default_rng(0).normal(size=(7, 20, 3)).astype(np.float32),
     "half": np.linspace(-1, 1, 5).astype(np.float16),
     "slots": np.arange(-3, 4, dtype=np.int32),
-    "sums": np.array([[-2**62, 2**62]], np.int64),
+    "sums": np.array([[-(2**62), 2**62]], np.int64),
     "support": np.array([2**63, 1], np.uint64),
     "stamps": np.array([2**32 - 1], np.uint32),
     "bytes": np.arange(5, dtype=np.uint8),
@@ -28,7 +28,12 @@ TENSORS = {
     "empty": np.zeros((0, 20), np.float32),
     "scalar": np.array(7, np.int64),
 }
-MANIFEST = {"voxel_size": 0.05, "encoder": {"l": 20, "seed": 1}, "name": "Küche", "flags": [True, None]}
+MANIFEST = {
+    "voxel_size": 0.05,
+    "encoder": {"l": 20, "seed": 1},
+    "name": "Küche",
+    "flags": [True, None],
+}
 SMALL = {"F": np.arange(6, dtype=np.float32).reshape(2, 3), "w": np.ones(2, np.uint8)}
 
 
@@ -40,13 +45,17 @@ def path(tmp_path):
 def assert_same_tensors(a: dict, b: dict) -> None:
     assert a.keys() == b.keys()
     for name, array in a.items():
-        assert b[name].dtype == array.dtype and b[name].shape == array.shape and b[name].tobytes() == array.tobytes(), name
+        assert (
+            b[name].dtype == array.dtype
+            and b[name].shape == array.shape
+            and b[name].tobytes() == array.tobytes()
+        ), name
 
 
 def split(data: bytes) -> tuple[dict, bytes]:
     """Header as JSON, and the bytes after it."""
     length = int.from_bytes(data[:8], "little")
-    return json.loads(data[8:8 + length]), data[8 + length:]
+    return json.loads(data[8 : 8 + length]), data[8 + length :]
 
 
 def join(header: dict, body: bytes) -> bytes:
@@ -55,11 +64,16 @@ def join(header: dict, body: bytes) -> bytes:
 
 
 def forge(header: dict, change) -> dict:
-    """The header with `change` done to its manifest and the manifest's sum made right again, as a liar would."""
+    """The header with `change` done to its manifest and the manifest's sum made right again, as a
+    liar would.
+    """
     manifest = json.loads(header["__metadata__"]["taichi_unifusion"])
     change(manifest)
     text = json.dumps(manifest)
-    metadata = {"taichi_unifusion": text, "taichi_unifusion_sha256": hashlib.sha256(text.encode()).hexdigest()}
+    metadata = {
+        "taichi_unifusion": text,
+        "taichi_unifusion_sha256": hashlib.sha256(text.encode()).hexdigest(),
+    }
     return {**header, "__metadata__": metadata}
 
 
@@ -71,7 +85,11 @@ def test_M8_round_trip_is_equal_bit_for_bit(path):
     assert {key: manifest[key] for key in MANIFEST} == MANIFEST
     assert manifest == read_manifest(path)
     assert manifest["format"] == FORMAT and manifest["format_version"] == 1
-    assert manifest["tensors"]["half"] | {"sha256": ""} == {"shape": [5], "dtype": "float16", "sha256": ""}
+    assert manifest["tensors"]["half"] | {"sha256": ""} == {
+        "shape": [5],
+        "dtype": "float16",
+        "sha256": "",
+    }
     first = path.read_bytes()
     write_map(path, tensors, manifest)  # what was read can be written again
     assert path.read_bytes() == first
@@ -99,9 +117,12 @@ def test_any_safetensors_library_reads_it(path):
 
 def test_what_a_map_cannot_hold_is_refused_before_writing(path):
     for tensors, manifest, message in (
-        ({"c": np.zeros(2, complex)}, {}, "'c' is complex128"), ({"o": np.array([{}])}, {}, "'o' is object"),
-        ({"__metadata__": np.zeros(2)}, {}, "cannot be named"), ({"d": np.zeros((1,) * 9)}, {}, "9 dimensions"),
-        ({}, {"x": np.nan}, "manifest"), ({}, {"x": object()}, "manifest"),
+        ({"c": np.zeros(2, complex)}, {}, "'c' is complex128"),
+        ({"o": np.array([{}])}, {}, "'o' is object"),
+        ({"__metadata__": np.zeros(2)}, {}, "cannot be named"),
+        ({"d": np.zeros((1,) * 9)}, {}, "9 dimensions"),
+        ({}, {"x": np.nan}, "manifest"),
+        ({}, {"x": object()}, "manifest"),
     ):
         with pytest.raises(InputError, match=message):
             write_map(path, tensors, manifest)
@@ -127,7 +148,11 @@ def test_M1_truncated_large_map_is_refused_at_once_and_without_memory(path):
     before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
     with pytest.raises(MapCorrupt, match="truncated"):
         read_map(path)
-    assert time.perf_counter() - start < 1 and resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
+    # KiB
+    assert (
+        time.perf_counter() - start < 1
+        and resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+    )
 
 
 def test_M2_any_flipped_bit_is_found(path):
@@ -135,7 +160,9 @@ def test_M2_any_flipped_bit_is_found(path):
     data = bytearray(path.read_bytes())
     header_end = 8 + int.from_bytes(data[:8], "little")
     rng = np.random.default_rng(0)
-    flips = {(i, bit) for i in range(header_end) for bit in rng.choice(8, 3, replace=False).tolist()}
+    flips = {
+        (i, bit) for i in range(header_end) for bit in rng.choice(8, 3, replace=False).tolist()
+    }
     flips |= {(i, bit) for i in range(header_end, len(data)) for bit in range(8)}
     unseen = []
     for i, bit in sorted(flips):
@@ -152,10 +179,17 @@ def test_M2_any_flipped_bit_is_found(path):
 
 def test_M3_not_ours(path):
     cases = {
-        b"": "is empty", b"PK\x03\x04" + b"\0" * 100: "zip archive", b"ply\nformat ascii 1.0\n" + b" " * 99: "PLY mesh",
-        b"\xff" * 100: "not a map file", b"hello": "not a map file", b"\0" * 8: "not a map file",
-        join({"F": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, b"\0" * 4): "no manifest",
-        join({"__metadata__": {"format": "pt"}}, b""): "no manifest", join([1], b""): "not a map file",
+        b"": "is empty",
+        b"PK\x03\x04" + b"\0" * 100: "zip archive",
+        b"ply\nformat ascii 1.0\n" + b" " * 99: "PLY mesh",
+        b"\xff" * 100: "not a map file",
+        b"hello": "not a map file",
+        b"\0" * 8: "not a map file",
+        join(
+            {"F": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, b"\0" * 4
+        ): "no manifest",
+        join({"__metadata__": {"format": "pt"}}, b""): "no manifest",
+        join([1], b""): "not a map file",
         (6).to_bytes(8, "little") + b"[" * 6: "not a map file",
         (1 << 20).to_bytes(8, "little") + b"[" * (1 << 20): "not a map file",
     }
@@ -170,7 +204,10 @@ def test_M3_not_ours(path):
         read_map(path.parent)
 
 
-@pytest.mark.parametrize(("version", "advice"), [(0, "again"), (2, "update"), (-1, "again"), ("1", "again"), (None, "again")])
+@pytest.mark.parametrize(
+    ("version", "advice"),
+    [(0, "again"), (2, "update"), (-1, "again"), ("1", "again"), (None, "again")],
+)
 def test_M3_other_version_names_both(path, version, advice):
     write_map(path, SMALL, {})
     header, body = split(path.read_bytes())
@@ -182,13 +219,34 @@ def test_M3_other_version_names_both(path, version, advice):
         read_map(path)
 
 
-@pytest.mark.parametrize("change", [
-    {"shape": [2**63, 3]}, {"shape": [2**31, 2**31]}, {"shape": [-2, -3]}, {"shape": [2, 3.0]}, {"shape": [True, 6]},
-    {"shape": [6, 3]}, {"shape": "23"}, {"shape": [1] * 40}, {"shape": [0, 2**63]}, {"dtype": "F64"}, {"dtype": "I32"},
-    {"dtype": "BOOL"}, {"dtype": "F99"}, {"dtype": 5}, {"data_offsets": [0, 2**63]}, {"data_offsets": [-24, 0]},
-    {"data_offsets": [4, 28]}, {"data_offsets": [24, 0]}, {"data_offsets": [0]}, {"shape": [2**60], "data_offsets": [0, 2**62]},
-    {"shape": [0, 3], "data_offsets": [0, 0]}, {"extra": 1},
-], ids=str)
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shape": [2**63, 3]},
+        {"shape": [2**31, 2**31]},
+        {"shape": [-2, -3]},
+        {"shape": [2, 3.0]},
+        {"shape": [True, 6]},
+        {"shape": [6, 3]},
+        {"shape": "23"},
+        {"shape": [1] * 40},
+        {"shape": [0, 2**63]},
+        {"dtype": "F64"},
+        {"dtype": "I32"},
+        {"dtype": "BOOL"},
+        {"dtype": "F99"},
+        {"dtype": 5},
+        {"data_offsets": [0, 2**63]},
+        {"data_offsets": [-24, 0]},
+        {"data_offsets": [4, 28]},
+        {"data_offsets": [24, 0]},
+        {"data_offsets": [0]},
+        {"shape": [2**60], "data_offsets": [0, 2**62]},
+        {"shape": [0, 3], "data_offsets": [0, 0]},
+        {"extra": 1},
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("both", [False, True], ids=["header lies", "manifest agrees"])
 def test_M4_lies_are_refused_before_allocation(path, change, both):
     write_map(path, {"F": SMALL["F"]}, {})
@@ -196,10 +254,14 @@ def test_M4_lies_are_refused_before_allocation(path, change, both):
     header["F"].update(change)
     if both:
         names = {"F64": "float64", "I32": "int32"}
-        said = {key: names.get(value, value) if key == "dtype" else value for key, value in change.items()}
+        said = {
+            key: names.get(value, value) if key == "dtype" else value
+            for key, value in change.items()
+        }
         header = forge(header, lambda m: m["tensors"]["F"].update(said))
     path.write_bytes(join(header, body))
-    if both and change == {"dtype": "I32"}:  # a full forgery of equal size, sums and all, is another valid map
+    # a full forgery of equal size, sums and all, is another valid map
+    if both and change == {"dtype": "I32"}:
         assert read_map(path)[0]["F"].dtype == np.int32
         return
     for read in (read_map, read_manifest):
@@ -212,7 +274,11 @@ def test_M4_counts_overlaps_and_gaps(path):
     write_map(path, {"a": np.zeros(2, np.uint8), "b": np.ones(2, np.uint8)}, {})
     header, body = split(path.read_bytes())
     for offsets in (([0, 2], [0, 2]), ([0, 2], [1, 3]), ([0, 2], [3, 5]), ([2, 4], [4, 6])):
-        changed = {**header, "a": {**entry, "data_offsets": offsets[0]}, "b": {**entry, "data_offsets": offsets[1]}}
+        changed = {
+            **header,
+            "a": {**entry, "data_offsets": offsets[0]},
+            "b": {**entry, "data_offsets": offsets[1]},
+        }
         path.write_bytes(join(changed, body + b"\0" * (max(offsets[1][1], 4) - 4)))
         with pytest.raises(MapCorrupt):
             read_map(path)
@@ -220,8 +286,13 @@ def test_M4_counts_overlaps_and_gaps(path):
     path.write_bytes(join(swapped, body))
     with pytest.raises(MapCorrupt, match="checksum"):
         read_map(path)
-    for change in (lambda m: m["tensors"].pop("a"), lambda m: m["tensors"].update(c=m["tensors"]["a"]),
-                   lambda m: m.pop("tensors"), lambda m: m["tensors"].update(a=[]), lambda m: m["tensors"]["a"].pop("sha256")):
+    for change in (
+        lambda m: m["tensors"].pop("a"),
+        lambda m: m["tensors"].update(c=m["tensors"]["a"]),
+        lambda m: m.pop("tensors"),
+        lambda m: m["tensors"].update(a=[]),
+        lambda m: m["tensors"]["a"].pop("sha256"),
+    ):
         path.write_bytes(join(forge(header, change), body))
         with pytest.raises(MapCorrupt):
             read_map(path)

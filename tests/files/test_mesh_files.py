@@ -11,7 +11,7 @@ from taichi_unifusion.errors import FileError, InputError
 from taichi_unifusion.files.meshes import read_mesh, write_mesh
 from taichi_unifusion.types import Mesh
 
-COLOR_STEP = 0.5 / 255 + 1e-6     # half a step of 8 bits, and float32 rounding
+COLOR_STEP = 0.5 / 255 + 1e-6  # half a step of 8 bits, and float32 rounding
 
 
 @pytest.fixture
@@ -19,24 +19,40 @@ def mesh() -> Mesh:
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(50, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Mesh(rng.normal(size=(50, 3)).astype(np.float32), rng.permutation(50)[:48].reshape(16, 3).astype(np.int32),
-                normals.astype(np.float32),
-                {"color": rng.random((50, 3)).astype(np.float32), "heat": rng.random((50, 1)).astype(np.float32),
-                 "clip_0": rng.random((50, 4)).astype(np.float32)})
+    return Mesh(
+        rng.normal(size=(50, 3)).astype(np.float32),
+        rng.permutation(50)[:48].reshape(16, 3).astype(np.int32),
+        normals.astype(np.float32),
+        {
+            "color": rng.random((50, 3)).astype(np.float32),
+            "heat": rng.random((50, 1)).astype(np.float32),
+            "clip_0": rng.random((50, 4)).astype(np.float32),
+        },
+    )
 
 
 def assert_equal_meshes(a: Mesh, b: Mesh) -> None:
     assert np.array_equal(a.vertices, b.vertices) and np.array_equal(a.faces, b.faces)
-    assert (a.normals is None) == (b.normals is None) and (a.normals is None or np.array_equal(a.normals, b.normals))
+    assert (a.normals is None) == (b.normals is None) and (
+        a.normals is None or np.array_equal(a.normals, b.normals)
+    )
     assert a.attributes.keys() == b.attributes.keys()
     for name, values in a.attributes.items():
         assert b.attributes[name].dtype == np.float32 and b.attributes[name].shape == values.shape
-        np.testing.assert_allclose(b.attributes[name], values, rtol=0, atol=COLOR_STEP if name == "color" else 0)
+        np.testing.assert_allclose(
+            b.attributes[name], values, rtol=0, atol=COLOR_STEP if name == "color" else 0
+        )
 
 
 def test_ply_round_trip(tmp_path, mesh):
-    for i, m in enumerate((mesh, Mesh(mesh.vertices, mesh.faces), Mesh(mesh.vertices, mesh.faces[:0]),
-                           Mesh(mesh.vertices[:0], mesh.faces[:0], mesh.normals[:0]))):
+    for i, m in enumerate(
+        (
+            mesh,
+            Mesh(mesh.vertices, mesh.faces),
+            Mesh(mesh.vertices, mesh.faces[:0]),
+            Mesh(mesh.vertices[:0], mesh.faces[:0], mesh.normals[:0]),
+        )
+    ):
         write_mesh(tmp_path / f"{i}.ply", m)
         assert_equal_meshes(m, read_mesh(tmp_path / f"{i}.ply"))
 
@@ -53,16 +69,27 @@ def test_other_programs_read_our_ply(tmp_path, mesh):
     trimesh = pytest.importorskip("trimesh")
     write_mesh(tmp_path / "a.ply", mesh)
     loaded = trimesh.load(tmp_path / "a.ply", process=False)
-    assert np.array_equal(loaded.vertices, mesh.vertices) and np.array_equal(loaded.faces, mesh.faces)
-    np.testing.assert_allclose(loaded.visual.vertex_colors[:, :3] / 255, mesh.attributes["color"], atol=COLOR_STEP)
+    assert np.array_equal(loaded.vertices, mesh.vertices) and np.array_equal(
+        loaded.faces, mesh.faces
+    )
+    np.testing.assert_allclose(
+        loaded.visual.vertex_colors[:, :3] / 255, mesh.attributes["color"], atol=COLOR_STEP
+    )
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
 def test_we_read_other_programs_ply(tmp_path, mesh, encoding):
     trimesh = pytest.importorskip("trimesh")
-    exported = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False,
-                               vertex_colors=(mesh.attributes["color"] * 255).round().astype(np.uint8))
-    text = exported.export(file_type="ply", encoding="ascii" if encoding == "ascii" else "binary", vertex_normal=True)
+    exported = trimesh.Trimesh(
+        mesh.vertices,
+        mesh.faces,
+        vertex_normals=mesh.normals,
+        process=False,
+        vertex_colors=(mesh.attributes["color"] * 255).round().astype(np.uint8),
+    )
+    text = exported.export(
+        file_type="ply", encoding="ascii" if encoding == "ascii" else "binary", vertex_normal=True
+    )
     (tmp_path / "a.ply").write_bytes(text.encode() if isinstance(text, str) else text)
     read = read_mesh(tmp_path / "a.ply")
     assert np.array_equal(read.faces, mesh.faces)
@@ -79,10 +106,16 @@ def test_ply_big_endian_polygons_and_other_elements(tmp_path):
     vertices = np.arange(15.0).reshape(5, 3)
     body = b"\x02" + np.array([1.5, 2.5], ">f4").tobytes()
     for row in vertices:
-        body += row.astype(">f8").tobytes() + np.array([0, 13107, 65535], ">u2").tobytes() + np.array([row[0]], ">f4").tobytes()
+        body += (
+            row.astype(">f8").tobytes()
+            + np.array([0, 13107, 65535], ">u2").tobytes()
+            + np.array([row[0]], ">f4").tobytes()
+        )
     for polygon in ([0, 1, 2], [0, 1, 2, 3], [4, 3]):
         body += b"\x07" + bytes([len(polygon)]) + np.array(polygon, ">u4").tobytes()
-    (tmp_path / "a.ply").write_bytes("\r\n".join(line.strip() for line in header.splitlines()).encode() + b"\r\n" + body)
+    (tmp_path / "a.ply").write_bytes(
+        "\r\n".join(line.strip() for line in header.splitlines()).encode() + b"\r\n" + body
+    )
     mesh = read_mesh(tmp_path / "a.ply")
     assert np.array_equal(mesh.vertices, vertices) and mesh.vertices.dtype == np.float32
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 1, 2], [0, 2, 3]]
@@ -98,8 +131,10 @@ def test_ply_truncated_anywhere_is_an_error(tmp_path, mesh, encoding):
     if encoding == "ascii":
         rows = [*mesh.vertices.tolist(), *([3, *face] for face in mesh.faces.tolist())]
         body = "\n".join(" ".join(map(str, row)) for row in rows)
-        data = (f"ply\nformat ascii 1.0\nelement vertex 50\nproperty float x\nproperty float y\nproperty float z\n"
-                f"element face 16\nproperty list uchar int vertex_indices\nend_header\n{body}").encode()
+        data = (
+            f"ply\nformat ascii 1.0\nelement vertex 50\nproperty float x\nproperty float y\nproperty float z\n"
+            f"element face 16\nproperty list uchar int vertex_indices\nend_header\n{body}"
+        ).encode()
     path.write_bytes(data)
     assert len(read_mesh(path).faces) == 16
     # in ascii, a cut within the last number leaves a shorter number: no reader can tell
@@ -117,28 +152,55 @@ FACE = "element face 1\nproperty list uchar int vertex_indices\n"
 CORNERS = "0 0 0\n1 0 0\n0 1 0\n"
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("", "not a PLY"),
-    ("solid cube", "not a PLY"),
-    ("ply\nformat ascii 1.0\n", "no end"),
-    (f"ply\nformat text 1.0\n{VERTEX}end_header\n{CORNERS}", "makes no sense: 'format text"),
-    (f"ply\n{VERTEX}end_header\n{CORNERS}", "names no format"),
-    (f"ply\nformat ascii 1.0\n{VERTEX.replace('3', '-3')}end_header\n{CORNERS}", "element vertex -3"),
-    (f"ply\nformat ascii 1.0\n{VERTEX.replace('3', '9' * 5000)}end_header\n{CORNERS}", "makes no sense"),
-    (f"ply\nformat ascii 1.0\n{VERTEX.replace('3', str(2**58))}end_header\n{CORNERS}", "truncated"),
-    (f"ply\nformat binary_little_endian 1.0\n{VERTEX.replace('3', str(2**58))}end_header\n{CORNERS}", "truncated"),
-    (f"ply\nformat ascii 1.0\n{VERTEX.replace('float y', 'float x')}end_header\n{CORNERS}", "'x' twice"),
-    (f"ply\nformat ascii 1.0\n{VERTEX.replace('float y', 'number y')}end_header\n{CORNERS}", "property number y"),
-    (f"ply\nformat ascii 1.0\n{VERTEX.replace('float y', 'float q')}end_header\n{CORNERS}", "x, y and z"),
-    (f"ply\nformat ascii 1.0\n{FACE}end_header\n3 0 1 2\n", "x, y and z"),
-    (f"ply\nformat ascii 1.0\n{VERTEX}end_header\n0 0 0\n1 zero 0\n0 1 0\n", "else than numbers"),
-    (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}3 0 1 3\n", "outside 0..2"),
-    (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}3 0 1 -1\n", "outside 0..2"),
-    (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}3 0 1 nan\n", "outside 0..2"),
-    (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}3 0 1 1.5\n", "not whole"),
-    (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}-3 0 1 2\n", "length -3"),
-    (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}nan 0 1 2\n", "length nan"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "not a PLY"),
+        ("solid cube", "not a PLY"),
+        ("ply\nformat ascii 1.0\n", "no end"),
+        (f"ply\nformat text 1.0\n{VERTEX}end_header\n{CORNERS}", "makes no sense: 'format text"),
+        (f"ply\n{VERTEX}end_header\n{CORNERS}", "names no format"),
+        (
+            f"ply\nformat ascii 1.0\n{VERTEX.replace('3', '-3')}end_header\n{CORNERS}",
+            "element vertex -3",
+        ),
+        (
+            f"ply\nformat ascii 1.0\n{VERTEX.replace('3', '9' * 5000)}end_header\n{CORNERS}",
+            "makes no sense",
+        ),
+        (
+            f"ply\nformat ascii 1.0\n{VERTEX.replace('3', str(2**58))}end_header\n{CORNERS}",
+            "truncated",
+        ),
+        (
+            f"ply\nformat binary_little_endian 1.0\n{VERTEX.replace('3', str(2**58))}end_header\n{CORNERS}",
+            "truncated",
+        ),
+        (
+            f"ply\nformat ascii 1.0\n{VERTEX.replace('float y', 'float x')}end_header\n{CORNERS}",
+            "'x' twice",
+        ),
+        (
+            f"ply\nformat ascii 1.0\n{VERTEX.replace('float y', 'number y')}end_header\n{CORNERS}",
+            "property number y",
+        ),
+        (
+            f"ply\nformat ascii 1.0\n{VERTEX.replace('float y', 'float q')}end_header\n{CORNERS}",
+            "x, y and z",
+        ),
+        (f"ply\nformat ascii 1.0\n{FACE}end_header\n3 0 1 2\n", "x, y and z"),
+        (
+            f"ply\nformat ascii 1.0\n{VERTEX}end_header\n0 0 0\n1 zero 0\n0 1 0\n",
+            "else than numbers",
+        ),
+        (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}3 0 1 3\n", "outside 0..2"),
+        (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}3 0 1 -1\n", "outside 0..2"),
+        (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}3 0 1 nan\n", "outside 0..2"),
+        (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}3 0 1 1.5\n", "not whole"),
+        (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}-3 0 1 2\n", "length -3"),
+        (f"ply\nformat ascii 1.0\n{VERTEX}{FACE}end_header\n{CORNERS}nan 0 1 2\n", "length nan"),
+    ],
+)
 def test_ply_that_lies_is_an_error(tmp_path, text, message):
     (tmp_path / "a.ply").write_text(text)
     with pytest.raises(FileError, match="a.ply: .*" + message):
@@ -183,10 +245,15 @@ def test_mesh_errors_say_what_to_do(tmp_path, mesh):
 def test_glb_keeps_order_colors_and_normals(tmp_path, mesh, name):
     trimesh = pytest.importorskip("trimesh")
     mesh.save(tmp_path / name)
-    geometry, = trimesh.load(tmp_path / name, process=False).geometry.values()
-    assert np.array_equal(geometry.vertices, mesh.vertices) and np.array_equal(geometry.faces, mesh.faces)
-    np.testing.assert_allclose(geometry.vertex_normals, mesh.normals, atol=1e-6)  # trimesh holds float64, GLB float32
-    np.testing.assert_allclose(geometry.visual.vertex_colors[:, :3] / 255, mesh.attributes["color"], atol=COLOR_STEP)
+    (geometry,) = trimesh.load(tmp_path / name, process=False).geometry.values()
+    assert np.array_equal(geometry.vertices, mesh.vertices) and np.array_equal(
+        geometry.faces, mesh.faces
+    )
+    # trimesh holds float64, GLB float32
+    np.testing.assert_allclose(geometry.vertex_normals, mesh.normals, atol=1e-6)
+    np.testing.assert_allclose(
+        geometry.visual.vertex_colors[:, :3] / 255, mesh.attributes["color"], atol=COLOR_STEP
+    )
 
 
 def test_obj_keeps_order_colors_and_normals(tmp_path, mesh):
@@ -200,7 +267,9 @@ def test_obj_keeps_order_colors_and_normals(tmp_path, mesh):
     np.testing.assert_allclose(v[:, :3], mesh.vertices, atol=1e-7)  # OBJ holds 8 digits
     np.testing.assert_allclose(v[:, 3:], mesh.attributes["color"], atol=COLOR_STEP)
     np.testing.assert_allclose(np.array(rows["vn"], float), mesh.normals, atol=1e-7)
-    assert [[corner.split("/")[0] for corner in face] for face in rows["f"]] == (mesh.faces + 1).astype(str).tolist()
+    assert [[corner.split("/")[0] for corner in face] for face in rows["f"]] == (
+        mesh.faces + 1
+    ).astype(str).tolist()
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])

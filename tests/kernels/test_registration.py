@@ -11,15 +11,22 @@ import reference_registration as reference
 
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
-from taichi_unifusion.kernels import registration as kernels
 from taichi_unifusion.geometry import se3
-from taichi_unifusion.tracking.pyramid import SurfelImage, SurfelPyramid, build_pyramid, reduce_frame, shrunk
+from taichi_unifusion.kernels import registration as kernels
+from taichi_unifusion.tracking.pyramid import (
+    SurfelImage,
+    SurfelPyramid,
+    build_pyramid,
+    reduce_frame,
+    shrunk,
+)
 from taichi_unifusion.tracking.registration import Target, evaluate, register
 
-UNIT = 1e-6         # float32 of numbers about 1
-SUMS = 2e-4         # float32 sums of some thousand terms of both signs, relative to the largest entry
-EXACT_MM, EXACT_DEGREES = 2.0, 0.1   # synthetic frames with a Kinect's noise, 10 cm apart
-BACK_MM, BACK_DEGREES = 3.0, 0.2     # what the project promises after a disturbance of 3 cm and 2 degrees
+UNIT = 1e-6  # float32 of numbers about 1
+SUMS = 2e-4  # float32 sums of some thousand terms of both signs, relative to the largest entry
+EXACT_MM, EXACT_DEGREES = 2.0, 0.1  # synthetic frames with a Kinect's noise, 10 cm apart
+# what the project promises after a disturbance of 3 cm and 2 degrees
+BACK_MM, BACK_DEGREES = 3.0, 0.2
 DEPTH_RANGE = 0.3, 6.0
 
 
@@ -32,7 +39,11 @@ def room():
 def pair(room):
     """Two pyramids and the true pose of the second in the first."""
     first, second = room[0], room[1]
-    return pyramid(first), pyramid(second), se3.inverse(first.T_world_camera) @ second.T_world_camera
+    return (
+        pyramid(first),
+        pyramid(second),
+        se3.inverse(first.T_world_camera) @ second.T_world_camera,
+    )
 
 
 def pyramid(frame) -> SurfelPyramid:
@@ -60,20 +71,24 @@ def surfels(seed: int, height: int = 12, width: int = 16) -> np.ndarray:
 
 def test_every_kernel_has_a_twin_of_its_name():
     loaded = import_module("taichi_unifusion.kernels.registration")
-    names = {name for name, value in vars(loaded).items() if getattr(value, "_is_wrapped_kernel", False)}
+    names = {
+        name for name, value in vars(loaded).items() if getattr(value, "_is_wrapped_kernel", False)
+    }
     assert names and {name for name in names if not hasattr(reference, name)} == set()
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3])
 def test_average_inverse_depth_keeps_to_the_nearest_surface(factor):
     rng = np.random.default_rng(0)
-    inverse = np.where(rng.uniform(size=(13, 17)) < 0.5, 0.5, 0.4) * rng.uniform(0.99, 1.01, (13, 17))
+    inverse = np.where(rng.uniform(size=(13, 17)) < 0.5, 0.5, 0.4) * rng.uniform(
+        0.99, 1.01, (13, 17)
+    )
     inverse = np.where(rng.uniform(size=inverse.shape) < 0.3, 0, inverse).astype(np.float32)
     averaged = np.empty((13 // factor, 17 // factor), np.float32)
     kernels.average_inverse_depth(inverse, factor, 0.03, averaged)
     expected = reference.average_inverse_depth(inverse, factor, 0.03)
     np.testing.assert_allclose(averaged, expected, atol=UNIT)
-    assert 0 < np.count_nonzero(expected) and (factor == 1 or np.count_nonzero(expected == 0))
+    assert np.count_nonzero(expected) > 0 and (factor == 1 or np.count_nonzero(expected == 0))
 
 
 def test_averages_of_images():
@@ -90,9 +105,14 @@ def test_pack_surfels():
     rng = np.random.default_rng(2)
     inverse = rng.uniform(0.2, 2, (8, 9)).astype(np.float32) * (rng.uniform(size=(8, 9)) < 0.8)
     normals = rng.normal(size=(8, 9, 3)).astype(np.float32) * (rng.uniform(size=(8, 9, 1)) < 0.8)
-    intensity, packed = rng.uniform(size=(8, 9)).astype(np.float32), np.empty((8, 9, kernels.CHANNELS), np.float32)
+    intensity, packed = (
+        rng.uniform(size=(8, 9)).astype(np.float32),
+        np.empty((8, 9, kernels.CHANNELS), np.float32),
+    )
     kernels.pack_surfels(inverse.astype(np.float32), normals.astype(np.float32), intensity, packed)
-    np.testing.assert_allclose(packed, reference.pack_surfels(inverse, normals, intensity), rtol=UNIT, atol=UNIT)
+    np.testing.assert_allclose(
+        packed, reference.pack_surfels(inverse, normals, intensity), rtol=UNIT, atol=UNIT
+    )
 
 
 @pytest.mark.parametrize(("step", "weight"), [(1, 0.3), (2, 0.3), (1, 0.0)])
@@ -103,20 +123,35 @@ def test_sum_normal_equations(step, weight):
     limits = np.array([0.04, 0.9, 1.0, 0.05, weight], np.float32)
     rows = -(-source.shape[0] // step)
     sums = np.empty((-(-rows // kernels.BLOCK_ROWS), kernels.SUMS), np.float32)
-    kernels.sum_normal_equations(source, target, K, np.ascontiguousarray(T[:3], np.float32), step, limits, sums)
-    H, b, counts = reference.sum_normal_equations(source.astype(float), target.astype(float), *K.astype(float), T, step,
-                                                  *limits.astype(float))
+    kernels.sum_normal_equations(
+        source, target, K, np.ascontiguousarray(T[:3], np.float32), step, limits, sums
+    )
+    H, b, counts = reference.sum_normal_equations(
+        source.astype(float), target.astype(float), *K.astype(float), T, step, *limits.astype(float)
+    )
     total = sums.sum(axis=0, dtype=np.float64)
-    np.testing.assert_allclose(total[:kernels.H_SIZE], H[np.triu_indices(6)], atol=SUMS * np.abs(H).max())
-    np.testing.assert_allclose(total[kernels.H_SIZE:kernels.SOURCE], b, atol=SUMS * np.abs(b).max())
-    np.testing.assert_allclose(total[kernels.SOURCE:], counts, rtol=SUMS)
-    assert (counts[[0, 1, 2]] > 20).all() and counts[0] > counts[1] > counts[2] and (counts[4] > 20) == (weight > 0)
+    np.testing.assert_allclose(
+        total[: kernels.H_SIZE], H[np.triu_indices(6)], atol=SUMS * np.abs(H).max()
+    )
+    np.testing.assert_allclose(
+        total[kernels.H_SIZE : kernels.SOURCE], b, atol=SUMS * np.abs(b).max()
+    )
+    np.testing.assert_allclose(total[kernels.SOURCE :], counts, rtol=SUMS)
+    assert (
+        (counts[[0, 1, 2]] > 20).all()
+        and counts[0] > counts[1] > counts[2]
+        and (counts[4] > 20) == (weight > 0)
+    )
 
 
 def test_the_gradient_is_that_of_the_cost():
-    """b is half the derivative of the weighted squares while weights and associations stand still: of the geometric part."""
-    source, target = surfels(5, 24, 32).astype(float), surfels(6, 26, 34).astype(float)  # with a margin for rounding
-    target[..., 0], target[..., 1:4] = 2.0, (0, 0, -1.0)  # one plane: moving does not change what a point is compared with
+    """b is half the derivative of the weighted squares while weights and associations stand still:
+    of the geometric part.
+    """
+    # with a margin for rounding
+    source, target = surfels(5, 24, 32).astype(float), surfels(6, 26, 34).astype(float)
+    # one plane: moving does not change what a point is compared with
+    target[..., 0], target[..., 1:4] = 2.0, (0, 0, -1.0)
     K, K_target = (40.0, 40.0, 15.5, 11.5), (40.0, 40.0, 16.5, 12.5)
     arguments = (1, 1.0, -1.0, 1e6, 0.05, 0.0)  # no gate, no robust weights, no colour
     H, b, _ = reference.sum_normal_equations(source, target, K, K_target, np.eye(4), *arguments)
@@ -127,7 +162,9 @@ def test_the_gradient_is_that_of_the_cost():
             for u in range(32):
                 if source[v, u, 0] > 0:
                     p = se3.exp(twist)[:3] @ [*reference.unprojected(u, v, source[v, u, 0], K), 1]
-                    variance = reference.axial_variance(2.0) + reference.axial_variance(source[v, u, 0])
+                    variance = reference.axial_variance(2.0) + reference.axial_variance(
+                        source[v, u, 0]
+                    )
                     total += (2.0 - p[2]) ** 2 / variance
         return total
 
@@ -159,7 +196,9 @@ def test_there_and_back_is_nowhere(pair):
 
 def test_a_frame_lies_on_itself(pair):
     first, _, _ = pair
-    assert apart(register(first, first, np.eye(4)).T_target_source, np.eye(4)) == pytest.approx((0, 0), abs=1e-3)
+    assert apart(register(first, first, np.eye(4)).T_target_source, np.eye(4)) == pytest.approx(
+        (0, 0), abs=1e-3
+    )
     itself = evaluate(first, first, np.eye(4))
     assert itself.fitness == itself.overlap == 1 and itself.rmse < UNIT
 
@@ -172,8 +211,12 @@ def test_disturbed_guesses_come_back_to_one_place(pair, weight):
     rng = np.random.default_rng(7)
     for _ in range(10):
         twist = rng.normal(size=6)
-        twist *= np.repeat([0.03 / np.linalg.norm(twist[:3]), np.radians(2) / np.linalg.norm(twist[3:])], 3)
-        distance, angle = apart(register(second, first, se3.exp(twist) @ optimum, weight).T_target_source, optimum)
+        twist *= np.repeat(
+            [0.03 / np.linalg.norm(twist[:3]), np.radians(2) / np.linalg.norm(twist[3:])], 3
+        )
+        distance, angle = apart(
+            register(second, first, se3.exp(twist) @ optimum, weight).T_target_source, optimum
+        )
         assert distance < BACK_MM and angle < BACK_DEGREES
 
 
@@ -181,7 +224,9 @@ def test_several_targets_have_one_frame_of_reference(room):
     """Two keyframes whose relative pose is known give what one of them gives."""
     frames = [room[i] for i in (0, 1, 2)]
     a, b, c = (pyramid(frame) for frame in frames)
-    T_a_b, T_a_c = (se3.inverse(frames[0].T_world_camera) @ frame.T_world_camera for frame in frames[1:])
+    T_a_b, T_a_c = (
+        se3.inverse(frames[0].T_world_camera) @ frame.T_world_camera for frame in frames[1:]
+    )
     found = register(c, [Target(a, np.eye(4)), Target(b, se3.inverse(T_a_b))], T_a_b)
     distance, angle = apart(found.T_target_source, T_a_c)
     assert distance < EXACT_MM and angle < EXACT_DEGREES
@@ -205,8 +250,14 @@ def test_a_flat_wall_fixes_nothing_along_it():
 def test_a_blank_wall_does_not_tell_where_the_camera_is(room, distance):
     rng, frame = np.random.default_rng(0), room[0]
     sigma = np.sqrt(reference.axial_variance(distance))
-    walls = [replace(frame, depth=(distance + rng.normal(0, sigma, frame.depth.shape)).astype(np.float32),
-                     color=rng.normal(200, 2, frame.color.shape).astype(np.uint8)) for _ in range(2)]
+    walls = [
+        replace(
+            frame,
+            depth=(distance + rng.normal(0, sigma, frame.depth.shape)).astype(np.float32),
+            color=rng.normal(200, 2, frame.color.shape).astype(np.uint8),
+        )
+        for _ in range(2)
+    ]
     first, second = (pyramid(wall) for wall in walls)
     found = register(second, first, np.eye(4))
     assert found.agreement > 0.9 and not found.determined  # it fits, anywhere along the wall
@@ -244,7 +295,11 @@ def test_levels_halve_and_end_before_they_are_too_small():
     sizes = [level.camera.size for level in pyramid(frame).levels]
     assert sizes == [(100, 75), (50, 37)]
     wide = SyntheticRoom(frames=1, width=1200, height=680)[0]
-    assert [level.camera.size for level in pyramid(wide).levels] == [(400, 226), (200, 113), (100, 56)]
+    assert [level.camera.size for level in pyramid(wide).levels] == [
+        (400, 226),
+        (200, 113),
+        (100, 56),
+    ]
 
 
 def test_open3d_finds_the_same(pair, room):
@@ -261,9 +316,12 @@ def test_open3d_finds_the_same(pair, room):
         made.colors = o3d.utility.Vector3dVector(points.attributes["color"].astype(float))
         return made.voxel_down_sample(0.03)
 
-    theirs = o3d.pipelines.registration.registration_colored_icp(cloud(room[1]), cloud(room[0]), 0.06, truth).transformation
+    theirs = o3d.pipelines.registration.registration_colored_icp(
+        cloud(room[1]), cloud(room[0]), 0.06, truth
+    ).transformation
     ours = register(second, first, np.eye(4)).T_target_source
-    assert apart(ours, theirs)[0] < 15 and apart(ours, theirs)[1] < 0.5  # they err by as much themselves, and more than ours
+    # they err by as much themselves, and more than ours
+    assert apart(ours, theirs)[0] < 15 and apart(ours, theirs)[1] < 0.5
     assert apart(ours, truth)[0] <= apart(theirs, truth)[0]
 
 
@@ -274,6 +332,10 @@ def test_real_frames_come_back_too(data):
     rng = np.random.default_rng(9)
     for _ in range(5):
         twist = rng.normal(size=6)
-        twist *= np.repeat([0.03 / np.linalg.norm(twist[:3]), np.radians(2) / np.linalg.norm(twist[3:])], 3)
-        distance, angle = apart(register(second, first, se3.exp(twist) @ optimum).T_target_source, optimum)
+        twist *= np.repeat(
+            [0.03 / np.linalg.norm(twist[:3]), np.radians(2) / np.linalg.norm(twist[3:])], 3
+        )
+        distance, angle = apart(
+            register(second, first, se3.exp(twist) @ optimum).T_target_source, optimum
+        )
         assert distance < BACK_MM and angle < BACK_DEGREES

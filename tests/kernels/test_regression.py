@@ -7,21 +7,27 @@ import pytest
 import reference
 from scenes import rough
 
-from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.kernels import fusion
 from taichi_unifusion.kernels.regression import TILE
 from taichi_unifusion.maps import PropertyMap, SurfaceMap
+from taichi_unifusion.maps.encoding import EncoderSettings
 
-LATENT = 3e-4   # relative to the largest entry of F: float32 features (2e-5), amplified by solving with noise d of 0.3 and more
+# relative to the largest entry of F: float32 features (2e-5), amplified by solving with noise d of
+# 0.3 and more
+LATENT = 3e-4
 SIX_RANKS = dict(encoder=EncoderSettings(rank=6, anchors=64), noise=0.3, voxel_size=0.05)
 
 
-def assert_equal_maps(target, twin: dict[tuple, reference.Voxel], latent_tolerance: float = LATENT) -> None:
+def assert_equal_maps(
+    target, twin: dict[tuple, reference.Voxel], latent_tolerance: float = LATENT
+) -> None:
     """The map holds exactly the oracle's voxels."""
     data = target._grid.export()
     assert list(map(tuple, data.keys.tolist())) == sorted(twin)
     np.testing.assert_array_equal(data.weights, [twin[key].w for key in sorted(twin)])
-    np.testing.assert_array_equal(reference.unpack_masks(data.masks), [twin[key].mask for key in sorted(twin)])
+    np.testing.assert_array_equal(
+        reference.unpack_masks(data.masks), [twin[key].mask for key in sorted(twin)]
+    )
     F = np.array([twin[key].F for key in sorted(twin)])
     np.testing.assert_allclose(data.latents, F, atol=latent_tolerance * np.abs(F).max())
 
@@ -37,36 +43,70 @@ def in_voxels(cloud, settings) -> np.ndarray:
 
 
 def surface_twin(settings, *clouds) -> dict:
-    return reference.fuse(reference.surface_frame(encoder_of(settings), in_voxels(cloud, settings), cloud.normals.astype(float),
-                                                  settings) for cloud in clouds)
+    return reference.fuse(
+        reference.surface_frame(
+            encoder_of(settings), in_voxels(cloud, settings), cloud.normals.astype(float), settings
+        )
+        for cloud in clouds
+    )
 
 
 def property_twin(target: PropertyMap, *clouds) -> dict:
     settings = target.settings
-    return reference.fuse(reference.property_frame(encoder_of(settings), in_voxels(cloud, settings),
-                                                   cloud.attributes[target.name].astype(float), settings) for cloud in clouds)
+    return reference.fuse(
+        reference.property_frame(
+            encoder_of(settings),
+            in_voxels(cloud, settings),
+            cloud.attributes[target.name].astype(float),
+            settings,
+        )
+        for cloud in clouds
+    )
 
 
-@pytest.mark.parametrize(("sampling", "gpis", "margin"), [
-    ("cells", "samples", 1), ("cells", "samples", 2), ("cells", "derivatives", 1), ("points", "samples", 1),
-    ("points", "derivatives", 1)])
+@pytest.mark.parametrize(
+    ("sampling", "gpis", "margin"),
+    [
+        ("cells", "samples", 1),
+        ("cells", "samples", 2),
+        ("cells", "derivatives", 1),
+        ("points", "samples", 1),
+        ("points", "derivatives", 1),
+    ],
+)
 def test_surface_regression_equals_the_oracle(sampling, gpis, margin):
-    """Two frames through encode_cells or encode_points, claim_slots and fuse; more samples a voxel than a tile holds."""
-    target = SurfaceMap(sampling=sampling, gpis=gpis, margin=margin, min_points=5, sample_distance=0.2, **SIX_RANKS)
+    """Two frames through encode_cells or encode_points, claim_slots and fuse; more samples a voxel
+    than a tile holds.
+    """
+    target = SurfaceMap(
+        sampling=sampling, gpis=gpis, margin=margin, min_points=5, sample_distance=0.2, **SIX_RANKS
+    )
     clouds = rough(0), rough(1, 900)
     for cloud in clouds:
         done = target.integrate(cloud)
     twin = surface_twin(target.settings, *clouds)
     assert_equal_maps(target, twin)
-    assert (done.points, done.voxels, done.total_voxels) == (900, len(surface_twin(target.settings, clouds[1])), len(twin))
+    assert (done.points, done.voxels, done.total_voxels) == (
+        900,
+        len(surface_twin(target.settings, clouds[1])),
+        len(twin),
+    )
     assert max(voxel.w for voxel in twin.values()) > 2 * TILE
 
 
-@pytest.mark.parametrize(("name", "channels", "prior", "sampling", "margin"), [
-    ("one", 1, "zero", "cells", 1), ("rgb", 3, "mean", "cells", 1), ("five", 5, "mean", "cells", 2),
-    ("rgb", 3, "mean", "points", 1)])
+@pytest.mark.parametrize(
+    ("name", "channels", "prior", "sampling", "margin"),
+    [
+        ("one", 1, "zero", "cells", 1),
+        ("rgb", 3, "mean", "cells", 1),
+        ("five", 5, "mean", "cells", 2),
+        ("rgb", 3, "mean", "points", 1),
+    ],
+)
 def test_property_regression_equals_the_oracle(name, channels, prior, sampling, margin):
-    target = PropertyMap(name, channels, prior=prior, sampling=sampling, margin=margin, min_points=3, **SIX_RANKS)
+    target = PropertyMap(
+        name, channels, prior=prior, sampling=sampling, margin=margin, min_points=3, **SIX_RANKS
+    )
     clouds = rough(2), rough(3, 900)
     for cloud in clouds:
         target.integrate(cloud)
@@ -76,7 +116,10 @@ def test_property_regression_equals_the_oracle(name, channels, prior, sampling, 
 def test_fuse_equals_its_twin():
     """Eq. 19 into new and old slots; -1 means no slot, whatever the weight says."""
     rng, rows, channels = np.random.default_rng(7), 3, 2
-    latents, weights = rng.normal(size=(40, rows, channels)).astype(np.float32), rng.integers(1, 50, 40).astype(np.float32)
+    latents, weights = (
+        rng.normal(size=(40, rows, channels)).astype(np.float32),
+        rng.integers(1, 50, 40).astype(np.float32),
+    )
     masks = rng.integers(0, 2**32, (40, 2), dtype=np.uint32)
     slots = np.where(np.arange(40) % 5 == 0, -1, rng.permutation(60)[:40]).astype(np.int32)
     old = rng.normal(size=(60, rows, channels)).astype(np.float32)
@@ -84,14 +127,22 @@ def test_fuse_equals_its_twin():
     old[old_weights == 0] = 0
     old_masks = rng.integers(0, 2**32, (60, 2), dtype=np.uint32)
     fused, fused_weights, fused_masks = old.copy(), old_weights.copy(), old_masks.copy()
-    beside = np.concatenate([np.full((40, rows, 3), 9, np.float32), latents], axis=2)  # another map's columns come first
-    fusion.fuse(rows, channels, 3, 40, slots, beside, weights, masks, 1.0, fused, fused_weights, fused_masks)
+    # another map's columns come first
+    beside = np.concatenate([np.full((40, rows, 3), 9, np.float32), latents], axis=2)
+    fusion.fuse(
+        rows, channels, 3, 40, slots, beside, weights, masks, 1.0, fused, fused_weights, fused_masks
+    )
 
     def voxels(F, w, m, keys):
-        return {int(k): reference.Voxel(F[n].astype(float), float(w[n]), m[n])
-                for n, k in enumerate(keys) if k >= 0 and w[n] > 0}
+        return {
+            int(k): reference.Voxel(F[n].astype(float), float(w[n]), m[n])
+            for n, k in enumerate(keys)
+            if k >= 0 and w[n] > 0
+        }
 
-    twin = reference.fuse([voxels(old, old_weights, old_masks, range(60)), voxels(latents, weights, masks, slots)])
+    twin = reference.fuse(
+        [voxels(old, old_weights, old_masks, range(60)), voxels(latents, weights, masks, slots)]
+    )
     for slot in range(60):
         if slot in twin:
             np.testing.assert_allclose(fused[slot], twin[slot].F, atol=1e-6)
@@ -99,5 +150,10 @@ def test_fuse_equals_its_twin():
             if old_weights[slot] == 0:  # what is loaded into an empty map is the same bit for bit
                 assert fused[slot].tobytes() == latents[list(slots).index(slot)].tobytes()
         if slot not in slots:
-            assert fused[slot].tobytes() == old[slot].tobytes() and fused_weights[slot] == old_weights[slot]
-    np.testing.assert_array_equal(fused_masks[slots[slots >= 0]], old_masks[slots[slots >= 0]] | masks[slots >= 0])
+            assert (
+                fused[slot].tobytes() == old[slot].tobytes()
+                and fused_weights[slot] == old_weights[slot]
+            )
+    np.testing.assert_array_equal(
+        fused_masks[slots[slots >= 0]], old_masks[slots[slots >= 0]] | masks[slots >= 0]
+    )

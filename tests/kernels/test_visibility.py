@@ -8,15 +8,15 @@ import reference
 import reference_visibility as twin
 
 from taichi_unifusion import PinholeCamera, SurfaceMap
-from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.kernels import visibility as kernels
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
 VS = 0.05
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 79.5, 59.5)
 ENCODER = EncoderSettings(rank=8, anchors=64)
-FLIPPED = 1e-3      # share of cells in which float32 puts a pixel, or a threshold, on the other side
-EVIDENCE = 1e-4     # [votes] of float32 weights about 1 and votes about 100
+FLIPPED = 1e-3  # share of cells in which float32 puts a pixel, or a threshold, on the other side
+EVIDENCE = 1e-4  # [votes] of float32 weights about 1 and votes about 100
 
 
 def pose(position, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
@@ -24,7 +24,12 @@ def pose(position, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> n
     T = np.eye(4)
     for angle, (i, j) in ((yaw, (2, 0)), (pitch, (1, 2)), (roll, (0, 1))):
         turn = np.eye(3)
-        turn[[i, j, i, j], [i, j, j, i]] = np.cos(angle), np.cos(angle), -np.sin(angle), np.sin(angle)
+        turn[[i, j, i, j], [i, j, j, i]] = (
+            np.cos(angle),
+            np.cos(angle),
+            -np.sin(angle),
+            np.sin(angle),
+        )
         T[:3, :3] = T[:3, :3] @ turn
     T[:3, 3] = position
     return T
@@ -32,17 +37,24 @@ def pose(position, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> n
 
 @pytest.fixture(scope="module")
 def voxels() -> dict[tuple, reference.Voxel]:
-    """Voxels around a camera at the origin, before and behind it and beside its image, with noisy planes in them."""
+    """Voxels around a camera at the origin, before and behind it and beside its image, with noisy
+    planes in them.
+    """
     rng, encoder = np.random.default_rng(0), reference.Encoder(ENCODER.rank, ENCODER.anchors)
     features = encoder((twin.CENTERS - 0.5) / 2)
     z = rng.integers(3, 18, (250, 1))
-    keys = np.vstack([np.hstack([rng.uniform(-0.6, 0.6, (250, 2)) * z, z]), rng.uniform(-18, 18, (80, 3))]).astype(int)
+    keys = np.vstack(
+        [np.hstack([rng.uniform(-0.6, 0.6, (250, 2)) * z, z]), rng.uniform(-18, 18, (80, 3))]
+    ).astype(int)
     found = {}
     for key in sorted(map(tuple, np.unique(keys, axis=0).tolist())):
         normal = rng.normal(size=3)
         plane = (twin.CENTERS - rng.uniform(0.2, 0.8, 3)) @ normal / np.linalg.norm(normal)
-        F = np.linalg.lstsq(features, plane[:, None], rcond=None)[0] * rng.choice([0.01, 1, 1, 1])  # some of them too flat
-        found[key] = reference.Voxel(F.astype(np.float32).astype(float), 5.0, rng.uniform(size=64) < 0.5)
+        # some of them too flat
+        F = np.linalg.lstsq(features, plane[:, None], rcond=None)[0] * rng.choice([0.01, 1, 1, 1])
+        found[key] = reference.Voxel(
+            F.astype(np.float32).astype(float), 5.0, rng.uniform(size=64) < 0.5
+        )
     return found
 
 
@@ -50,7 +62,9 @@ def voxels() -> dict[tuple, reference.Voxel]:
 def depth() -> np.ndarray:
     """Readings from 0.2 to 1 m in patches, a third of them none; 1 at all borders."""
     rng = np.random.default_rng(1)
-    image = np.kron(rng.uniform(0.2, 1, (15, 20)) * (rng.uniform(size=(15, 20)) > 0.3), np.ones((8, 8)))
+    image = np.kron(
+        rng.uniform(0.2, 1, (15, 20)) * (rng.uniform(size=(15, 20)) > 0.3), np.ones((8, 8))
+    )
     image[[0, -1]] = image[:, [0, -1]] = 1.0
     return image.astype(np.float32)
 
@@ -63,23 +77,45 @@ def pack_masks(masks: np.ndarray) -> np.ndarray:
 def vote(voxels: dict, depth: np.ndarray, T: np.ndarray, sign: int, evidence: np.ndarray) -> None:
     target = SurfaceMap(encoder=ENCODER)
     keys = np.array(list(voxels), np.int32)
-    kernels.vote_cells(ENCODER.rank, len(keys), keys, pack_masks(np.array([v.mask for v in voxels.values()])),
-                       np.array([v.F for v in voxels.values()], np.float32), target._regressor.cell_gradients.to_numpy(), VS,
-                       depth, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, np.ascontiguousarray(T[:3], np.float32), sign,
-                       evidence)
+    kernels.vote_cells(
+        ENCODER.rank,
+        len(keys),
+        keys,
+        pack_masks(np.array([v.mask for v in voxels.values()])),
+        np.array([v.F for v in voxels.values()], np.float32),
+        target._regressor.cell_gradients.to_numpy(),
+        VS,
+        depth,
+        CAMERA.fx,
+        CAMERA.fy,
+        CAMERA.cx,
+        CAMERA.cy,
+        np.ascontiguousarray(T[:3], np.float32),
+        sign,
+        evidence,
+    )
 
 
-@pytest.mark.parametrize("T", [pose((0.003, 0.0017, -0.0021)), pose((0.1, -0.05, 0.02), 0.4, -0.3, 1.0)],
-                         ids=["straight", "turned"])
+@pytest.mark.parametrize(
+    "T",
+    [pose((0.003, 0.0017, -0.0021)), pose((0.1, -0.05, 0.02), 0.4, -0.3, 1.0)],
+    ids=["straight", "turned"],
+)
 def test_vote_cells_equals_its_twin(voxels, depth, T):
-    """Before and behind the camera, inside and outside the image; the same frame with sign -1 takes its votes out.
+    """Before and behind the camera, inside and outside the image; the same frame with sign -1 takes
+    its votes out.
 
     The camera is never quite at the origin, where cells fall exactly between pixels.
     """
     evidence = np.zeros((len(voxels), 64), np.int8)
     vote(voxels, depth, T, 1, evidence)
-    wanted = np.array(list(twin.vote_cells(reference.Encoder(ENCODER.rank, ENCODER.anchors), voxels, VS, depth, CAMERA,
-                                           T).values()))
+    wanted = np.array(
+        list(
+            twin.vote_cells(
+                reference.Encoder(ENCODER.rank, ENCODER.anchors), voxels, VS, depth, CAMERA, T
+            ).values()
+        )
+    )
     assert min((wanted == v).sum() for v in (-1, 1)) > 100 and (evidence != wanted).mean() < FLIPPED
     vote(voxels, depth, T, -1, evidence)
     assert not evidence.any()
@@ -109,14 +145,22 @@ def test_a_reading_at_the_image_border_counts_and_one_pixel_on_does_not():
         center = np.array([(u - CAMERA.cx) / CAMERA.fx, 0.0, 1.0]) * 50
         key = tuple(np.floor(center / VS).astype(int).tolist())
         evidence = np.zeros((1, 64), np.int8)
-        vote({key: reference.Voxel(np.zeros((ENCODER.rank, 1)), 1.0, np.zeros(64, bool))},
-             np.full((120, 160), 100, np.float32), np.eye(4), 1, evidence)
+        vote(
+            {key: reference.Voxel(np.zeros((ENCODER.rank, 1)), 1.0, np.zeros(64, bool))},
+            np.full((120, 160), 100, np.float32),
+            np.eye(4),
+            1,
+            evidence,
+        )
         assert evidence.all() == evidence.any() == seen, u
 
 
 def test_add_evidence_equals_its_twin():
     rng = np.random.default_rng(3)
-    old, more = rng.integers(-127, 128, (50, 64), dtype=np.int8), rng.integers(-127, 128, (30, 64), dtype=np.int8)
+    old, more = (
+        rng.integers(-127, 128, (50, 64), dtype=np.int8),
+        rng.integers(-127, 128, (30, 64), dtype=np.int8),
+    )
     slots, added = rng.permutation(50)[:30].astype(np.int32), old.copy()
     kernels.add_evidence(slots, more, added)
     np.testing.assert_array_equal(added[slots], twin.add_evidence(old[slots], more))
@@ -129,13 +173,19 @@ def test_interpolate_evidence_equals_its_twin():
     keys = np.unique(rng.integers(-2, 2, (40, 3)), axis=0).astype(np.int32)
     slots = np.empty(len(keys), np.int32)
     grid.claim(len(keys), keys, np.ones(len(keys), np.float32), slots)
-    masks, evidence = rng.uniform(size=(grid.capacity, 64)) < 0.5, rng.integers(-127, 128, (grid.capacity, 64), dtype=np.int8)
+    masks, evidence = (
+        rng.uniform(size=(grid.capacity, 64)) < 0.5,
+        rng.integers(-127, 128, (grid.capacity, 64), dtype=np.int8),
+    )
     masks[slots[0]] = False
     x, values = rng.uniform(-2.5, 2.5, (2000, 3)), np.empty(2000, np.float32)
     points = (x * VS).astype(np.float32)
     kernels.interpolate_evidence(points, 1 / VS, grid.slot, pack_masks(masks), evidence, values)
     by_key = {tuple(key): s for key, s in zip(keys.tolist(), slots, strict=True)}
-    wanted = twin.interpolate_evidence({key: evidence[s] for key, s in by_key.items()},
-                                       {key: masks[s] for key, s in by_key.items()}, points.astype(float) / VS)
+    wanted = twin.interpolate_evidence(
+        {key: evidence[s] for key, s in by_key.items()},
+        {key: masks[s] for key, s in by_key.items()},
+        points.astype(float) / VS,
+    )
     assert 0.2 < (wanted == 1).mean() < 0.9
     assert (np.abs(values - wanted) > EVIDENCE * 127).mean() < FLIPPED

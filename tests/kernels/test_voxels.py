@@ -1,4 +1,6 @@
-"""Voxel index and per-frame binning: the kernels against their twins, and the index range, growth and reuse of trees."""
+"""Voxel index and per-frame binning: the kernels against their twins, and the index range, growth
+and reuse of trees.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,8 @@ from taichi_unifusion.maps.frame_blocks import FrameBlocks
 from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
 VS = 0.05
-FIXED = 1e-6      # 24 fractional bits, rounded once a run of points, and float32 sums within a run
-POSITION = 5e-6   # [voxels] float32 positions some voxels from the origin
+FIXED = 1e-6  # 24 fractional bits, rounded once a run of points, and float32 sums within a run
+POSITION = 5e-6  # [voxels] float32 positions some voxels from the origin
 OFFSETS = np.array([-0.1, 0.0, 0.2], np.float32)  # not symmetric, so that a wrong sign shows
 
 
@@ -31,7 +33,9 @@ def grid() -> VoxelGrid:
 
 @pytest.fixture(scope="module")
 def cloud():
-    """Points about the origin, so that indices of both signs occur, with runs in one cell and lone points."""
+    """Points about the origin, so that indices of both signs occur, with runs in one cell and lone
+    points.
+    """
     return rough(0, 1200)
 
 
@@ -42,16 +46,20 @@ def in_voxels(points) -> np.ndarray:
 
 def keys_of(blocks: FrameBlocks) -> list[tuple]:
     """Voxel of each block."""
-    return list(map(tuple, blocks.keys.to_numpy()[:blocks.count].tolist()))
+    return list(map(tuple, blocks.keys.to_numpy()[: blocks.count].tolist()))
 
 
 def by_cell(blocks: FrameBlocks, keys: list[tuple]) -> dict:
     """Lattice cell -> (count, mean sums)."""
     counts, sums = blocks.counts.to_numpy(), blocks.sums.to_numpy() / cell_kernels.FIXED
-    occupied = np.argwhere(counts[:len(keys)])
-    lattice = 4 * np.array(keys)[occupied[:, 0]] + np.stack(np.unravel_index(occupied[:, 1], (4, 4, 4)), axis=1)
-    return {tuple(at): (counts[b, cell], sums[b, cell] / counts[b, cell])
-            for at, (b, cell) in zip(lattice.tolist(), occupied, strict=True)}
+    occupied = np.argwhere(counts[: len(keys)])
+    lattice = 4 * np.array(keys)[occupied[:, 0]] + np.stack(
+        np.unravel_index(occupied[:, 1], (4, 4, 4)), axis=1
+    )
+    return {
+        tuple(at): (counts[b, cell], sums[b, cell] / counts[b, cell])
+        for at, (b, cell) in zip(lattice.tolist(), occupied, strict=True)
+    }
 
 
 def test_touch_points_equals_its_twin(grid, cloud):
@@ -59,7 +67,9 @@ def test_touch_points_equals_its_twin(grid, cloud):
     for part in (cloud, taken(cloud, slice(5))):  # a second frame gives numbers anew
         blocks.touch(part.points, VS)
         keys = keys_of(blocks)
-        assert len(set(keys)) == len(keys) and set(keys) == reference.touch_points(in_voxels(part.points))
+        assert len(set(keys)) == len(keys) and set(keys) == reference.touch_points(
+            in_voxels(part.points)
+        )
     assert min(min(key) for key in keys_of(blocks)) < 0
 
 
@@ -79,24 +89,34 @@ def test_block_of_points_equals_its_twin(grid, cloud):
     blocks.touch(cloud.points, VS)
     found = np.empty(len(cloud), np.int32)
     kernels.block_of_points(cloud.points, 1 / VS, grid.block, found)
-    np.testing.assert_array_equal(np.array(keys_of(blocks))[found], reference.block_of_points(in_voxels(cloud.points)))
+    np.testing.assert_array_equal(
+        np.array(keys_of(blocks))[found], reference.block_of_points(in_voxels(cloud.points))
+    )
 
 
 def test_bin_points_equals_its_twin(grid, cloud):
     blocks = FrameBlocks(grid, 3, with_positions=True)
     blocks.touch(cloud.points, VS)
     blocks.bin(cloud.points, [cloud.normals], VS)
-    binned, twin = by_cell(blocks, keys_of(blocks)), reference.bin_points(in_voxels(cloud.points), cloud.normals.astype(float))
+    binned, twin = (
+        by_cell(blocks, keys_of(blocks)),
+        reference.bin_points(in_voxels(cloud.points), cloud.normals.astype(float)),
+    )
     assert binned.keys() == twin.keys() and max(count for count, _, _ in twin.values()) > 3
     for cell, (count, normal, position) in twin.items():
         assert binned[cell][0] == count
         np.testing.assert_allclose(binned[cell][1][:3], normal, atol=FIXED)
-        np.testing.assert_allclose(binned[cell][1][3:], position - (np.array(cell) + 0.5) / 4, atol=POSITION)
+        np.testing.assert_allclose(
+            binned[cell][1][3:], position - (np.array(cell) + 0.5) / 4, atol=POSITION
+        )
 
 
 def test_the_order_of_points_does_not_change_the_sums(grid, cloud):
     order, sums = np.random.default_rng(1).permutation(len(cloud)), []
-    for points, normals in ((cloud.points, cloud.normals), (cloud.points[order], cloud.normals[order])):
+    for points, normals in (
+        (cloud.points, cloud.normals),
+        (cloud.points[order], cloud.normals[order]),
+    ):
         blocks = FrameBlocks(grid, 3, with_positions=True)
         blocks.touch(points, VS)
         blocks.bin(points, [normals], VS)
@@ -108,27 +128,39 @@ def test_the_order_of_points_does_not_change_the_sums(grid, cloud):
 
 
 def test_surfel_kernels_equal_their_twins(grid, cloud):
-    surfels, samples = FrameBlocks(grid, 3, with_positions=True), FrameBlocks(grid, 4, with_positions=False)
+    surfels, samples = (
+        FrameBlocks(grid, 3, with_positions=True),
+        FrameBlocks(grid, 4, with_positions=False),
+    )
     surfels.touch(cloud.points, VS)
     surfels.bin(cloud.points, [cloud.normals], VS)
     assert surfels.touch_samples(OFFSETS)
     samples.bin_samples(surfels, OFFSETS)
     x, normals = in_voxels(cloud.points), cloud.normals.astype(float)
     keys = keys_of(samples)
-    assert len(set(keys)) == len(keys) and set(keys) == reference.touch_surfel_samples(x, normals, OFFSETS.astype(float))
-    assert len(keys) > surfels.count                                     # samples reach voxels without points
-    binned, twin = by_cell(samples, keys), reference.bin_surfel_samples(x, normals, OFFSETS.astype(float))
+    assert len(set(keys)) == len(keys) and set(keys) == reference.touch_surfel_samples(
+        x, normals, OFFSETS.astype(float)
+    )
+    assert len(keys) > surfels.count  # samples reach voxels without points
+    binned, twin = (
+        by_cell(samples, keys),
+        reference.bin_surfel_samples(x, normals, OFFSETS.astype(float)),
+    )
     assert binned.keys() == twin.keys()
     for cell, (count, distance, normal) in twin.items():
         assert binned[cell][0] == count
         np.testing.assert_allclose(binned[cell][1], [*distance, *normal], atol=POSITION)
-    assert not surfels.counts.to_numpy().any() and not surfels.sums.to_numpy().any()  # read last, left zero
+    # read last, left zero
+    assert not surfels.counts.to_numpy().any() and not surfels.sums.to_numpy().any()
 
 
 def test_normals_that_cancel_give_no_samples(grid):
     points = np.full((2, 3), 0.006, np.float32)
     normals = np.array([[0, 0, 1], [0, 0, -1]], np.float32)
-    surfels, samples = FrameBlocks(grid, 3, with_positions=True), FrameBlocks(grid, 4, with_positions=False)
+    surfels, samples = (
+        FrameBlocks(grid, 3, with_positions=True),
+        FrameBlocks(grid, 4, with_positions=False),
+    )
     surfels.touch(points, VS)
     surfels.bin(points, [normals], VS)
     assert surfels.touch_samples(OFFSETS)
@@ -140,16 +172,20 @@ def test_mark_and_compact_cells_equal_their_twins(grid, cloud):
     blocks = FrameBlocks(grid, 3, with_positions=False)
     blocks.touch(cloud.points, VS)
     blocks.bin(cloud.points, [cloud.normals], VS)
-    keys, counts = keys_of(blocks), blocks.counts.to_numpy()[:blocks.count]
-    rows = reference.compact_cells(counts, blocks.sums.to_numpy()[:blocks.count] / cell_kernels.FIXED)
+    keys, counts = keys_of(blocks), blocks.counts.to_numpy()[: blocks.count]
+    rows = reference.compact_cells(
+        counts, blocks.sums.to_numpy()[: blocks.count] / cell_kernels.FIXED
+    )
     lattice = {cell: value[0] for cell, value in by_cell(blocks, keys).items()}
     blocks.compact(3)
     for minimum, masks in ((1, blocks.masks), (3, blocks.support)):
         twin = reference.mark_cells(lattice, minimum)
-        np.testing.assert_array_equal(reference.unpack_masks(masks.to_numpy()[:blocks.count]), [twin[key] for key in keys])
-    np.testing.assert_array_equal(blocks.totals.to_numpy()[:blocks.count], counts.sum(axis=1))
+        np.testing.assert_array_equal(
+            reference.unpack_masks(masks.to_numpy()[: blocks.count]), [twin[key] for key in keys]
+        )
+    np.testing.assert_array_equal(blocks.totals.to_numpy()[: blocks.count], counts.sum(axis=1))
     np.testing.assert_array_equal(np.diff([*blocks.starts, len(rows)]), (counts > 0).sum(axis=1))
-    np.testing.assert_allclose(blocks.cells.to_numpy()[:len(rows)], rows, rtol=FIXED, atol=FIXED)
+    np.testing.assert_allclose(blocks.cells.to_numpy()[: len(rows)], rows, rtol=FIXED, atol=FIXED)
     assert not blocks.counts.to_numpy().any() and not blocks.sums.to_numpy().any()
 
 
@@ -158,7 +194,9 @@ def test_a_frame_of_more_voxels_than_expected_is_given_room(grid):
     blocks = FrameBlocks(grid, 3, with_positions=True)
     before = blocks.capacity
     blocks.touch(scattered, VS)
-    assert blocks.count > before and set(keys_of(blocks)) == reference.touch_points(in_voxels(scattered))
+    assert blocks.count > before and set(keys_of(blocks)) == reference.touch_points(
+        in_voxels(scattered)
+    )
     blocks.bin(scattered, [scattered], VS)
     assert blocks.counts.to_numpy().sum() == len(scattered)
 
@@ -175,7 +213,8 @@ def test_claim_gather_and_copy_equal_a_dict(cloud):
     """Slots are given once, in any order; export is sorted; growth keeps everything."""
     grid, kept, rng = VoxelGrid(rows=2, channels=3), {}, np.random.default_rng(4)
     for _ in range(3):
-        keys = np.unique(rng.integers(-20, 20, (3000, 3)), axis=0).astype(np.int32)  # more than the first room in total
+        # more than the first room in total
+        keys = np.unique(rng.integers(-20, 20, (3000, 3)), axis=0).astype(np.int32)
         weights = rng.integers(0, 3, len(keys)).astype(np.float32)
         slots = np.empty(len(keys), np.int32)
         wanted = grid.claim(len(keys), keys, weights, slots)
@@ -183,7 +222,9 @@ def test_claim_gather_and_copy_equal_a_dict(cloud):
         for key, slot in zip(map(tuple, keys.tolist()), slots.tolist(), strict=True):
             if slot >= 0:
                 assert kept.setdefault(key, slot) == slot
-    assert grid.count == len(kept) > voxel_grid.FIRST_CAPACITY and sorted(kept.values()) == list(range(len(kept)))
+    assert grid.count == len(kept) > voxel_grid.FIRST_CAPACITY and sorted(kept.values()) == list(
+        range(len(kept))
+    )
     latents = rng.normal(size=(grid.capacity, 2, 3)).astype(np.float32)
     grid.latents.from_numpy(latents)
     grid.weights.from_numpy(latents[:, 0, 0].copy())
@@ -193,12 +234,18 @@ def test_claim_gather_and_copy_equal_a_dict(cloud):
     data = grid.export()
     assert list(map(tuple, data.keys.tolist())) == sorted(kept)
     order = [kept[key] for key in sorted(kept)]
-    for found, written in ((data.latents, latents), (data.weights, latents[:, 0, 0]), (data.masks, masks)):
+    for found, written in (
+        (data.latents, latents),
+        (data.weights, latents[:, 0, 0]),
+        (data.masks, masks),
+    ):
         np.testing.assert_array_equal(found, written[order])
 
 
 def test_find_release_and_row_copies_equal_a_dict():
-    """A voxel without weight is given up, the others stay; rows follow their slots into a larger pool and out of it."""
+    """A voxel without weight is given up, the others stay; rows follow their slots into a larger
+    pool and out of it.
+    """
     grid, rng = VoxelGrid(rows=1, channels=1, evidence=True, sums=7), np.random.default_rng(5)
     keys = np.unique(rng.integers(-9, 9, (500, 3)), axis=0).astype(np.int32)
     ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
@@ -240,13 +287,19 @@ def test_forty_maps_one_after_the_other_share_a_tree_that_starts_empty(cloud):
     grid = VoxelGrid(rows=1, channels=1)
     tree, trees = grid._tree, runtime.current().trees[0]
     for n in range(40):
-        assert grid._tree is tree and grid.count == 0 and kernels.count_leaves(grid.leaf_parent) == 0
+        assert (
+            grid._tree is tree and grid.count == 0 and kernels.count_leaves(grid.leaf_parent) == 0
+        )
         blocks = FrameBlocks(grid, 1, with_positions=False)
         here = moved(cloud, (n * VS, 0, 0))
         blocks.touch(here.points, VS)
         assert set(keys_of(blocks)) == reference.touch_points(in_voxels(here.points))
         slots = np.empty(blocks.count, np.int32)
-        assert grid.claim(blocks.count, blocks.keys, np.ones(blocks.count, np.float32), slots) == blocks.count == grid.count
+        assert (
+            grid.claim(blocks.count, blocks.keys, np.ones(blocks.count, np.float32), slots)
+            == blocks.count
+            == grid.count
+        )
         del blocks, grid
         grid = VoxelGrid(rows=1, channels=1)
     assert runtime.current().trees[0] == trees
@@ -264,7 +317,9 @@ def test_more_live_maps_than_taichi_bears_are_refused(monkeypatch):
 
 def test_an_index_that_would_pass_safe_memory_is_refused(monkeypatch):
     grid = VoxelGrid(rows=1, channels=1)
-    keys = np.stack(np.meshgrid(*[np.arange(0, 60, 4)] * 3), axis=-1).reshape(-1, 3).astype(np.int32)
+    keys = (
+        np.stack(np.meshgrid(*[np.arange(0, 60, 4)] * 3), axis=-1).reshape(-1, 3).astype(np.int32)
+    )
     ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
     assert grid.claim(len(keys), keys, ones, slots) == len(keys)
     monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * (len(keys) - 1))
@@ -283,7 +338,12 @@ def test_lone_points_that_make_no_voxel_also_count_against_safe_memory(monkeypat
     with pytest.raises(CapacityError, match="larger voxels or save"):
         for _ in range(20):
             blocks.touch(rng.uniform(-200, 200, (1000, 3)).astype(np.float32), VS)
-            grid.claim(blocks.count, blocks.keys, np.zeros(blocks.count, np.float32), np.empty(blocks.count, np.int32))
+            grid.claim(
+                blocks.count,
+                blocks.keys,
+                np.zeros(blocks.count, np.float32),
+                np.empty(blocks.count, np.int32),
+            )
 
 
 def test_a_grid_of_another_runtime_is_refused(grid, cloud, monkeypatch):

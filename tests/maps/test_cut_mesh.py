@@ -8,7 +8,7 @@ from test_meshing import assert_welded
 
 from taichi_unifusion.maps.meshing import cut_mesh
 
-AREA = 1e-4         # relative: cuts go through vertices that are this near, in edges
+AREA = 1e-4  # relative: cuts go through vertices that are this near, in edges
 
 
 @pytest.fixture(scope="module")
@@ -24,24 +24,41 @@ def sheet():
     (ux, uy), (vx, vy) = (places[faces[:, k]].T - places[faces[:, 0]].T for k in (1, 2))
     turned = ux * vy < uy * vx
     faces[turned] = faces[turned][:, ::-1]
-    return np.column_stack([places, np.zeros(len(places))]).astype(np.float32), faces.astype(np.int32)
+    return np.column_stack([places, np.zeros(len(places))]).astype(np.float32), faces.astype(
+        np.int32
+    )
 
 
 def assert_cut(sheet, values, area: float) -> None:
     vertices, faces = cut_mesh(*sheet, values.astype(np.float32))
     assert_welded(vertices, faces)
-    assert vertices.dtype == np.float32 and faces.dtype == np.int32 and len(np.unique(vertices, axis=0)) == len(vertices)
+    assert (
+        vertices.dtype == np.float32
+        and faces.dtype == np.int32
+        and len(np.unique(vertices, axis=0)) == len(vertices)
+    )
     a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
     doubled = np.cross(b - a, c - a)
-    assert (doubled[:, 2] > -1e-9).all() and doubled[:, 2].sum() / 2 == pytest.approx(area, rel=AREA)
+    assert (doubled[:, 2] > -1e-9).all() and doubled[:, 2].sum() / 2 == pytest.approx(
+        area, rel=AREA
+    )
     pairs = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     uses = np.unique(pairs, axis=0, return_counts=True)[1]
     assert uses.max() == 2
-    assert len(vertices) - len(uses) + len(faces) == 1  # Euler: one piece without holes: an edge is cut once
+    # Euler: one piece without holes: an edge is cut once
+    assert len(vertices) - len(uses) + len(faces) == 1
 
 
-@pytest.mark.parametrize(("slope", "offset", "area"), [((1, 0), -0.3, 0.7), ((-1, 0), 0.3, 0.3), ((0, 1), -0.55, 0.45),
-                                                       ((1, 1), -1, 0.5), ((-1, -1), 0.5, 0.125)])
+@pytest.mark.parametrize(
+    ("slope", "offset", "area"),
+    [
+        ((1, 0), -0.3, 0.7),
+        ((-1, 0), 0.3, 0.3),
+        ((0, 1), -0.55, 0.45),
+        ((1, 1), -1, 0.5),
+        ((-1, -1), 0.5, 0.125),
+    ],
+)
 def test_a_cut_along_a_line_leaves_the_area_on_its_side(sheet, slope, offset, area):
     assert_cut(sheet, sheet[0][:, :2] @ slope + offset, area)
 
@@ -53,8 +70,12 @@ def test_a_cut_through_vertices_makes_no_slivers_and_no_vertex_twice():
     places = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1).astype(np.float32)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
     faces = np.vstack([a + [0, n, n + 1], a + [0, n + 1, 1]]).astype(np.int32)
-    for values, area in ((places[:, 0] - 3, 40), (3 - places[:, 0], 24), (places[:, 0] + places[:, 1] - 8, 32),
-                         (np.where(places[:, 0] < 4, 0, -1), 24)):
+    for values, area in (
+        (places[:, 0] - 3, 40),
+        (3 - places[:, 0], 24),
+        (places[:, 0] + places[:, 1] - 8, 32),
+        (np.where(places[:, 0] < 4, 0, -1), 24),
+    ):
         assert_cut((places, faces), values, area)
 
 

@@ -7,18 +7,19 @@ import pytest
 import reference
 from scipy.special import gamma, kv
 
+from taichi_unifusion.errors import InputError
+from taichi_unifusion.kernels import encoding as kernels
 from taichi_unifusion.maps.encoding import (
     EncoderSettings,
     PositionEncoding,
     matern72,
     position_encoding,
 )
-from taichi_unifusion.errors import InputError
-from taichi_unifusion.kernels import encoding as kernels
 
-KERNEL_ERROR = 0.0058 * 1.03  # what 256 anchors and 20 eigenpairs reach on 2000 random points; other samples differ by 3 %
-EXACT = 1e-9                  # float64 formulas written twice; the smallest kept eigenvalue is about 0.8
-SINGLE = 2e-5                 # float32: sums over 256 anchors of products whose terms cancel to some 1 %
+# what 256 anchors and 20 eigenpairs reach on 2000 random points; other samples differ by 3 %
+KERNEL_ERROR = 0.0058 * 1.03
+EXACT = 1e-9  # float64 formulas written twice; the smallest kept eigenvalue is about 0.8
+SINGLE = 2e-5  # float32: sums over 256 anchors of products whose terms cancel to some 1 %
 SMALL = EncoderSettings(rank=7, anchors=50, length_scale=0.3, seed=4)
 SETTINGS = [EncoderSettings(), SMALL]
 
@@ -29,16 +30,27 @@ def oracle(settings: EncoderSettings) -> reference.Encoder:
 
 @pytest.fixture(scope="module")
 def t() -> np.ndarray:
-    """Encoder coordinates: random ones, the cube's corners, its centre, and an anchor, where the distance is zero."""
+    """Encoder coordinates: random ones, the cube's corners, its centre, and an anchor, where the
+    distance is zero.
+    """
     corners = reference.CORNERS - 0.5
-    return np.vstack([np.random.default_rng(3).uniform(-0.5, 0.5, (300, 3)), corners, np.zeros((1, 3)),
-                      PositionEncoding(EncoderSettings()).anchors[:1]])
+    return np.vstack(
+        [
+            np.random.default_rng(3).uniform(-0.5, 0.5, (300, 3)),
+            corners,
+            np.zeros((1, 3)),
+            PositionEncoding(EncoderSettings()).anchors[:1],
+        ]
+    )
 
 
 def test_matern72_is_the_general_matern_kernel():
     d, nu, rho = np.linspace(1e-3, 2, 200), 3.5, 0.4753
     s = np.sqrt(2 * nu) * d / rho
-    np.testing.assert_allclose(matern72(d, rho), 2 ** (1 - nu) / gamma(nu) * s**nu * kv(nu, s), rtol=1e-10)  # Eq. 12
+    # Eq. 12
+    np.testing.assert_allclose(
+        matern72(d, rho), 2 ** (1 - nu) / gamma(nu) * s**nu * kv(nu, s), rtol=1e-10
+    )
     assert matern72(0.0, rho) == 1
 
 
@@ -46,12 +58,15 @@ def test_matern72_is_the_general_matern_kernel():
 def test_encoding_equals_the_oracle(settings, t):
     encoding = PositionEncoding(settings)
     np.testing.assert_allclose(encoding(t), oracle(settings)(t), atol=EXACT)
-    np.testing.assert_allclose(encoding.gradient(t), oracle(settings).gradient(t), atol=1e-7)  # the twin takes differences
+    # the twin takes differences
+    np.testing.assert_allclose(encoding.gradient(t), oracle(settings).gradient(t), atol=1e-7)
 
 
 def test_features_of_the_anchors_are_the_leading_part_of_their_kernel_matrix():
     encoding = position_encoding(EncoderSettings())
-    values, vectors = np.linalg.eigh(reference.kernel_matrix(encoding.anchors, encoding.anchors, 0.4753))
+    values, vectors = np.linalg.eigh(
+        reference.kernel_matrix(encoding.anchors, encoding.anchors, 0.4753)
+    )
     leading = (vectors[:, -20:] * values[-20:]) @ vectors[:, -20:].T
     features = encoding(encoding.anchors)
     np.testing.assert_allclose(features @ features.T, leading, atol=1e-10)
@@ -59,23 +74,41 @@ def test_features_of_the_anchors_are_the_leading_part_of_their_kernel_matrix():
 
 def test_kernel_error_is_small_and_falls_with_rank_and_anchors():
     assert PositionEncoding(EncoderSettings()).kernel_error() <= KERNEL_ERROR
-    by_rank = [PositionEncoding(EncoderSettings(rank=rank)).kernel_error() for rank in (5, 10, 20, 40, 80)]
-    assert all(after < 0.7 * before for before, after in zip(by_rank, by_rank[1:], strict=False)), by_rank
-    by_anchors = [np.mean([PositionEncoding(EncoderSettings(anchors=anchors, seed=s)).kernel_error(500) for s in range(3)])
-                  for anchors in (20, 64, 256)]
-    assert all(after < before for before, after in zip(by_anchors, by_anchors[1:], strict=False)), by_anchors
+    by_rank = [
+        PositionEncoding(EncoderSettings(rank=rank)).kernel_error() for rank in (5, 10, 20, 40, 80)
+    ]
+    assert all(after < 0.7 * before for before, after in zip(by_rank, by_rank[1:], strict=False)), (
+        by_rank
+    )
+    by_anchors = [
+        np.mean(
+            [
+                PositionEncoding(EncoderSettings(anchors=anchors, seed=s)).kernel_error(500)
+                for s in range(3)
+            ]
+        )
+        for anchors in (20, 64, 256)
+    ]
+    assert all(after < before for before, after in zip(by_anchors, by_anchors[1:], strict=False)), (
+        by_anchors
+    )
 
 
 def test_kernel_error_measures_the_kernel():
     settings, t = EncoderSettings(), np.random.default_rng(1).uniform(-0.5, 0.5, (400, 3))
     features = oracle(settings)(t)
-    error = np.abs(reference.kernel_matrix(t, t, settings.length_scale) - features @ features.T).mean()
+    error = np.abs(
+        reference.kernel_matrix(t, t, settings.length_scale) - features @ features.T
+    ).mean()
     assert PositionEncoding(settings).kernel_error(400) == pytest.approx(error, rel=1e-6)
 
 
 def test_encoding_is_deterministic_and_seeded():
     first, again, other = (PositionEncoding(EncoderSettings(seed=seed)) for seed in (0, 0, 1))
-    assert first.anchors.tobytes() == again.anchors.tobytes() and first.projection.tobytes() == again.projection.tobytes()
+    assert (
+        first.anchors.tobytes() == again.anchors.tobytes()
+        and first.projection.tobytes() == again.projection.tobytes()
+    )
     assert not np.allclose(first.anchors, other.anchors)
     assert position_encoding(EncoderSettings()) is position_encoding(EncoderSettings())
 
@@ -92,7 +125,9 @@ def test_settings_that_make_no_encoder_are_refused(wrong):
 
 
 def test_decoupled_regression_approaches_the_exact_process():
-    """Eq. 5 and 6 against Eq. 3: with more eigenpairs the latent predicts what the full Gaussian process does."""
+    """Eq. 5 and 6 against Eq. 3: with more eigenpairs the latent predicts what the full Gaussian
+    process does.
+    """
     rng = np.random.default_rng(5)
     X, X_new = rng.uniform(-0.5, 0.5, (80, 3)), rng.uniform(-0.4, 0.4, (50, 3))
     Y = np.sin(4 * X[:, :1]) + X[:, 1:2] ** 2
@@ -100,42 +135,72 @@ def test_decoupled_regression_approaches_the_exact_process():
     errors = []
     for rank in (5, 20, 80, 250):
         encoder = PositionEncoding(EncoderSettings(rank=rank))
-        errors.append(np.abs(encoder(X_new) @ reference.regress_dual(encoder(X), Y, 0.1) - exact).mean())
-    assert errors[0] > errors[1] > errors[2] > errors[3] and errors[1] < 0.03 and errors[3] < 1e-3, errors
+        errors.append(
+            np.abs(encoder(X_new) @ reference.regress_dual(encoder(X), Y, 0.1) - exact).mean()
+        )
+    assert (
+        errors[0] > errors[1] > errors[2] > errors[3] and errors[1] < 0.03 and errors[3] < 1e-3
+    ), errors
 
 
 def test_primal_form_equals_dual_form():
-    """Eq. 6 as printed (n x n) and as solved here (l x l), with repeated rows as weights, and with derivatives (Eq. 16-17)."""
+    """Eq. 6 as printed (n x n) and as solved here (l x l), with repeated rows as weights, and with
+    derivatives (Eq. 16-17).
+    """
     rng = np.random.default_rng(6)
     encoder = PositionEncoding(EncoderSettings())
     t, counts = rng.uniform(-0.5, 0.5, (40, 3)), rng.integers(1, 6, 40)
     P, Y = encoder(t), rng.normal(size=(40, 3))
     for noise in (0.01, 1.0):
-        dual = reference.regress_dual(np.repeat(P, counts, axis=0), np.repeat(Y, counts, axis=0), noise)
+        dual = reference.regress_dual(
+            np.repeat(P, counts, axis=0), np.repeat(Y, counts, axis=0), noise
+        )
         np.testing.assert_allclose(reference.regress(P, counts, Y, noise), dual, atol=1e-9)
         gradient = np.moveaxis(encoder.gradient(t), 1, 0)
-        stacked, targets = np.vstack([P, *(0.5 * gradient)]), np.vstack([np.zeros((40, 1)), *Y.T[:, :, None]])
+        stacked, targets = (
+            np.vstack([P, *(0.5 * gradient)]),
+            np.vstack([np.zeros((40, 1)), *Y.T[:, :, None]]),
+        )
         np.testing.assert_allclose(
-            reference.encode_voxel(oracle(encoder.settings), t, np.ones(40), np.zeros((40, 1)), Y, noise, centered=False),
-            reference.regress_dual(stacked, targets, noise), atol=1e-7)
+            reference.encode_voxel(
+                oracle(encoder.settings),
+                t,
+                np.ones(40),
+                np.zeros((40, 1)),
+                Y,
+                noise,
+                centered=False,
+            ),
+            reference.regress_dual(stacked, targets, noise),
+            atol=1e-7,
+        )
 
 
 def parameters(encoding: PositionEncoding) -> tuple[np.ndarray, np.ndarray, float]:
     """Anchors, projection and scale as the kernels take them."""
     scale = np.sqrt(7) / encoding.settings.length_scale
-    return (np.ascontiguousarray(encoding.anchors.T * scale, np.float32),
-            np.ascontiguousarray(encoding.projection.T, np.float32), scale)
+    return (
+        np.ascontiguousarray(encoding.anchors.T * scale, np.float32),
+        np.ascontiguousarray(encoding.projection.T, np.float32),
+        scale,
+    )
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=["default", "small"])
 def test_encode_positions_equals_its_twin(settings, t):
     features = np.empty((len(t), settings.rank), np.float32)
-    kernels.encode_positions(settings.rank, t.astype(np.float32), *parameters(PositionEncoding(settings)), features)
-    np.testing.assert_allclose(features, reference.encode_positions(oracle(settings), t.astype(np.float32)), atol=SINGLE)
+    kernels.encode_positions(
+        settings.rank, t.astype(np.float32), *parameters(PositionEncoding(settings)), features
+    )
+    np.testing.assert_allclose(
+        features, reference.encode_positions(oracle(settings), t.astype(np.float32)), atol=SINGLE
+    )
 
 
 def test_encode_gradients_equals_its_twin(t):
     gradients = np.empty((len(t), 3, SMALL.rank), np.float32)
-    kernels.encode_gradients(SMALL.rank, t.astype(np.float32), *parameters(PositionEncoding(SMALL)), gradients)
+    kernels.encode_gradients(
+        SMALL.rank, t.astype(np.float32), *parameters(PositionEncoding(SMALL)), gradients
+    )
     twin = reference.encode_gradients(oracle(SMALL), t.astype(np.float32).astype(float))
     np.testing.assert_allclose(gradients, twin, atol=SINGLE * np.abs(twin).max())

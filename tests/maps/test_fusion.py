@@ -1,4 +1,6 @@
-"""Fusion over frames: the batch regression of all samples, removal of a frame, and voxels that are given up."""
+"""Fusion over frames: the batch regression of all samples, removal of a frame, and voxels that are
+given up.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +12,20 @@ from test_map_laws import KINDS, answers, frames, integrated
 from test_regression import LATENT, assert_equal_maps, encoder_of, in_voxels
 
 from taichi_unifusion import PropertyMap, SurfaceMap, load_map
-from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.errors import MapCorrupt, OutOfRange
-from taichi_unifusion.kernels import fusion
 from taichi_unifusion.files.maps import read_map, write_map
+from taichi_unifusion.kernels import fusion
 from taichi_unifusion.maps import voxel_grid
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.regressor import sum_count
 
 SIX_RANKS = dict(encoder=EncoderSettings(rank=6, anchors=64), noise=0.3, voxel_size=0.05)
-MEAN_REST = 2e-5         # relative to the largest latent: Eq. 19 backwards, where a frame of some times the weight is taken out
-INFORMATION_REST = 2e-4  # the same for sums: rounding of sums over all frames, then a solve with noise 0.3
-ORDER = 1e-4             # relative: float32 sums of some thousand samples in another order, then the solve
+# relative to the largest latent: Eq. 19 backwards, where a frame of some times the weight is taken
+# out
+MEAN_REST = 2e-5
+# the same for sums: rounding of sums over all frames, then a solve with noise 0.3
+INFORMATION_REST = 2e-4
+ORDER = 1e-4  # relative: float32 sums of some thousand samples in another order, then the solve
 FUSIONS = ("mean", "information")
 
 
@@ -52,6 +57,7 @@ def rest_of(target) -> float:
 
 # ---- Against the twins ----
 
+
 def packed(sums: twin.Sums, size: int) -> np.ndarray:
     """The sums of a voxel in the order of `keep_sums`, padded to `size`."""
     rank = len(sums.G)
@@ -77,22 +83,62 @@ def test_fuse_information_equals_its_twin(centered):
     q = sum_count(rank, channels, centered)
     map_sums = np.array([packed(s, size) * k for s, k in zip(old, known, strict=True)], np.float32)
     map_weights = np.array([s.w * k for s, k in zip(old, known, strict=True)], np.float32)
-    map_latents, map_masks = np.zeros((voxels, rank + centered, channels), np.float32), np.zeros((voxels, 2), np.uint32)
-    sums, weights = np.array([packed(s, size) for s in new], np.float32), np.array([s.w for s in new], np.float32)
+    map_latents, map_masks = (
+        np.zeros((voxels, rank + centered, channels), np.float32),
+        np.zeros((voxels, 2), np.uint32),
+    )
+    sums, weights = (
+        np.array([packed(s, size) for s in new], np.float32),
+        np.array([s.w for s in new], np.float32),
+    )
     masks = rng.integers(0, 2**32, (voxels, 2), dtype=np.uint32)
     assert sums.shape == (voxels, q)
     arrays = map_sums, map_latents, map_weights, map_masks
-    fusion.fuse_information(rank, size, rows, channels, centered, 0, channels, voxels, slots, sums, weights, masks, 1.0, 0.3,
-                            *arrays)
+    fusion.fuse_information(
+        rank,
+        size,
+        rows,
+        channels,
+        centered,
+        0,
+        channels,
+        voxels,
+        slots,
+        sums,
+        weights,
+        masks,
+        1.0,
+        0.3,
+        *arrays,
+    )
     for n in range(voxels):
         if slots[n] >= 0:
             F, w = twin.fuse_information([old[n], new[n]], [int(known[n]), 1], 0.3)
             assert map_weights[n] == w and (map_masks[n] == masks[n]).all()
             np.testing.assert_allclose(map_latents[n], F, atol=LATENT * np.abs(F).max())
         else:
-            assert not map_latents[n].any() and map_weights[n] == old[n].w * known[n] and not map_masks[n].any()
-    fusion.fuse_information(rank, size, rows, channels, centered, 0, channels, voxels, slots, sums, weights, masks, -1.0, 0.3,
-                            *arrays)
+            assert (
+                not map_latents[n].any()
+                and map_weights[n] == old[n].w * known[n]
+                and not map_masks[n].any()
+            )
+    fusion.fuse_information(
+        rank,
+        size,
+        rows,
+        channels,
+        centered,
+        0,
+        channels,
+        voxels,
+        slots,
+        sums,
+        weights,
+        masks,
+        -1.0,
+        0.3,
+        *arrays,
+    )
     for n in np.flatnonzero(slots >= 0):
         assert map_weights[n] == old[n].w * known[n]
         if known[n]:
@@ -109,39 +155,76 @@ def test_fuse_with_sign_minus_one_undoes_it():
     masks, slots = np.zeros((20, 2), np.uint32), np.arange(20, dtype=np.int32)
     latents, left = old.copy(), weights.copy()
     for sign in (1.0, -1.0):
-        fusion.fuse(rows, channels, 0, 20, slots, new, more, masks, sign, latents, left, masks.copy())
+        fusion.fuse(
+            rows, channels, 0, 20, slots, new, more, masks, sign, latents, left, masks.copy()
+        )
     np.testing.assert_array_equal(left, weights)
     np.testing.assert_allclose(latents[5:], old[5:], atol=3e-5)  # weights differ up to 50-fold
     assert not left[:5].any()
 
 
-@pytest.mark.parametrize(("sampling", "gpis"), [("cells", "samples"), ("cells", "derivatives"), ("points", "samples")])
+@pytest.mark.parametrize(
+    ("sampling", "gpis"), [("cells", "samples"), ("cells", "derivatives"), ("points", "samples")]
+)
 def test_information_fusion_is_one_regression_over_all_frames(sampling, gpis):
     """Surface: every voxel's F from the samples of all frames that encode it."""
-    target = SurfaceMap(sampling=sampling, gpis=gpis, fusion="information", min_points=5, sample_distance=0.2, **SIX_RANKS)
+    target = SurfaceMap(
+        sampling=sampling,
+        gpis=gpis,
+        fusion="information",
+        min_points=5,
+        sample_distance=0.2,
+        **SIX_RANKS,
+    )
     clouds = rough(0), rough(1, 900), moved(rough(2, 600), (0.03, 0, 0.01))
     integrated(target, clouds)
-    frames = [twin.surface_samples(encoder_of(target.settings), in_voxels(cloud, target.settings),
-                                        cloud.normals.astype(float), target.settings) for cloud in clouds]
+    frames = [
+        twin.surface_samples(
+            encoder_of(target.settings),
+            in_voxels(cloud, target.settings),
+            cloud.normals.astype(float),
+            target.settings,
+        )
+        for cloud in clouds
+    ]
     assert_equal_maps(target, twin.regress_all(frames, target.settings.noise))
 
 
-@pytest.mark.parametrize(("prior", "sampling"), [("mean", "cells"), ("zero", "cells"), ("mean", "points")])
+@pytest.mark.parametrize(
+    ("prior", "sampling"), [("mean", "cells"), ("zero", "cells"), ("mean", "points")]
+)
 def test_information_fusion_of_a_property_is_one_regression_over_all_frames(prior, sampling):
-    target = PropertyMap("rgb", 3, prior=prior, sampling=sampling, fusion="information", min_points=3, **SIX_RANKS)
+    target = PropertyMap(
+        "rgb", 3, prior=prior, sampling=sampling, fusion="information", min_points=3, **SIX_RANKS
+    )
     clouds = rough(2), rough(3, 900)
     integrated(target, clouds)
-    frames = [twin.property_samples(encoder_of(target.settings), in_voxels(cloud, target.settings),
-                                         cloud.attributes["rgb"].astype(float), target.settings) for cloud in clouds]
+    frames = [
+        twin.property_samples(
+            encoder_of(target.settings),
+            in_voxels(cloud, target.settings),
+            cloud.attributes["rgb"].astype(float),
+            target.settings,
+        )
+        for cloud in clouds
+    ]
     assert_equal_maps(target, twin.regress_all(frames, target.settings.noise))
 
 
 # ---- Laws ----
 
+
 def test_one_frame_is_the_same_by_both_fusions():
     for kind in KINDS.values():
-        assert_close(*(integrated(kind(fusion=fused_by), frames()[:1]) if fused_by == "mean" else _without_sums(
-            integrated(kind(fusion=fused_by), frames()[:1])) for fused_by in FUSIONS), ORDER)
+        assert_close(
+            *(
+                integrated(kind(fusion=fused_by), frames()[:1])
+                if fused_by == "mean"
+                else _without_sums(integrated(kind(fusion=fused_by), frames()[:1]))
+                for fused_by in FUSIONS
+            ),
+            ORDER,
+        )
 
 
 def _without_sums(target):
@@ -152,10 +235,16 @@ def _without_sums(target):
 
 def test_points_of_two_clouds_in_one_or_in_two_frames_are_the_same_regression():
     """With every point a sample, information fusion does not care in which frame a sample came."""
-    settings = dict(fusion="information", sampling="points", min_points=1, voxel_size=0.05, noise=0.3)
+    settings = dict(
+        fusion="information", sampling="points", min_points=1, voxel_size=0.05, noise=0.3
+    )
     clouds = rough(0, 600), rough(1, 500)
-    a, b = (integrated(PropertyMap("rgb", 3, encoder=EncoderSettings(rank=8, anchors=64), **settings), given)
-            for given in (clouds, [joined(*clouds)]))
+    a, b = (
+        integrated(
+            PropertyMap("rgb", 3, encoder=EncoderSettings(rank=8, anchors=64), **settings), given
+        )
+        for given in (clouds, [joined(*clouds)])
+    )
     assert_close(a, b, ORDER)
 
 
@@ -176,13 +265,18 @@ def test_a_removed_frame_leaves_the_map_without_it(new):
     assert_close(target, without, rest_of(target), masks=False)
     ours, theirs = target._grid.export(), without._grid.export()
     assert ((ours.masks & theirs.masks) == theirs.masks).all()
-    np.testing.assert_allclose(np.frombuffer(answers(target)[0], np.float32), np.frombuffer(answers(without)[0], np.float32),
-                               atol=10 * rest_of(target))
+    np.testing.assert_allclose(
+        np.frombuffer(answers(target)[0], np.float32),
+        np.frombuffer(answers(without)[0], np.float32),
+        atol=10 * rest_of(target),
+    )
     assert answers(target)[1] == answers(without)[1]
 
 
 def test_what_is_removed_can_be_integrated_again(new):
-    """Voxels given up and seen again are as if seen for the first time; the same with room made for more."""
+    """Voxels given up and seen again are as if seen for the first time; the same with room made for
+    more.
+    """
     a, b, c = frames()
     target, whole = integrated(new(), (a, b, c)), integrated(new(), (a, b, c))
     for _ in range(2):
@@ -208,9 +302,13 @@ def test_a_map_from_which_all_was_removed_is_empty_and_of_use(new, tmp_path):
     fresh = integrated(new(), [c])
     for other in (target, empty):
         other.integrate(c)
-        assert [array.tobytes() for array in _arrays(other)] == [array.tobytes() for array in _arrays(fresh)]
+        assert [array.tobytes() for array in _arrays(other)] == [
+            array.tobytes() for array in _arrays(fresh)
+        ]
     target.save(tmp_path / "again")
-    assert [x.tobytes() for x in _arrays(load_map(tmp_path / "again"))] == [x.tobytes() for x in _arrays(fresh)]
+    assert [x.tobytes() for x in _arrays(load_map(tmp_path / "again"))] == [
+        x.tobytes() for x in _arrays(fresh)
+    ]
 
 
 def _arrays(target) -> list[np.ndarray]:
@@ -257,7 +355,9 @@ def test_growing_pools_keep_everything(new, monkeypatch):
     whole = integrated(new(), frames())
     monkeypatch.setattr(voxel_grid, "FIRST_CAPACITY", 4)
     small = integrated(new(), frames())
-    assert small._grid.capacity > 4 and [x.tobytes() for x in _arrays(small)] == [x.tobytes() for x in _arrays(whole)]
+    assert small._grid.capacity > 4 and [x.tobytes() for x in _arrays(small)] == [
+        x.tobytes() for x in _arrays(whole)
+    ]
 
 
 def test_sums_are_kept_only_where_they_are_used():
@@ -270,8 +370,14 @@ def test_damaged_sums_are_refused(tmp_path):
     integrated(KINDS["surface"](fusion="information"), frames()[:1]).save(tmp_path / "map")
     tensors, manifest = read_map(tmp_path / "map")
     sums = tensors.pop("sums")
-    for damaged, message in ((None, "'sums' should be"), (sums[:, 1:].copy(), "'sums' should be"),
-                             (sums.astype(float), "'sums' should be"), (sums * np.float32(np.nan), "not finite")):
-        write_map(tmp_path / "map", tensors if damaged is None else {**tensors, "sums": damaged}, manifest)
+    for damaged, message in (
+        (None, "'sums' should be"),
+        (sums[:, 1:].copy(), "'sums' should be"),
+        (sums.astype(float), "'sums' should be"),
+        (sums * np.float32(np.nan), "not finite"),
+    ):
+        write_map(
+            tmp_path / "map", tensors if damaged is None else {**tensors, "sums": damaged}, manifest
+        )
         with pytest.raises(MapCorrupt, match=message):
             load_map(tmp_path / "map")

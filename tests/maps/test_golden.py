@@ -10,13 +10,16 @@ from pathlib import Path
 import pytest
 
 GOLDEN = Path(__file__).parent / "golden"
-ROUNDING = 2e-3  # relative: what another processor's order of summation may change in a mean over a whole map
+# relative: what another processor's order of summation may change in a mean over a whole map
+ROUNDING = 2e-3
 
 
 @pytest.fixture(scope="module")
 def made() -> dict:
     """Hashes and summaries of the maps as they are made now, in a process with one thread."""
-    done = subprocess.run([sys.executable, GOLDEN / "make_maps.py"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, GOLDEN / "make_maps.py"], capture_output=True, text=True, check=True
+    )
     return json.loads(done.stdout)
 
 

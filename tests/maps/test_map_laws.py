@@ -12,22 +12,38 @@ from conftest import DEVICE
 from scenes import cloud_of, moved, rough, taken
 
 from taichi_unifusion import PropertyMap, SurfaceMap, load_map, runtime
-from taichi_unifusion.maps.encoding import EncoderSettings
-from taichi_unifusion.errors import CapacityError, InputError, MapCorrupt, OutOfRange, RuntimeStateError
+from taichi_unifusion.errors import (
+    CapacityError,
+    InputError,
+    MapCorrupt,
+    OutOfRange,
+    RuntimeStateError,
+)
 from taichi_unifusion.maps import voxel_grid
+from taichi_unifusion.maps.encoding import EncoderSettings
 
-ORDER = 1e-5     # relative: Eq. 19 in float32, three frames in another order; N3 asks for 1e-4
-FLIPPED = 0.02   # share of a voxel's samples that rounding far from the origin moves into another cell
+ORDER = 1e-5  # relative: Eq. 19 in float32, three frames in another order; N3 asks for 1e-4
+# share of a voxel's samples that rounding far from the origin moves into another cell
+FLIPPED = 0.02
 FLIPPED_LATENTS = 40  # times FAR: what such samples change, all of them in thinly filled voxels
-FAR = 3e-3       # relative to the largest latent: float32 positions 4800 voxels away are known to 5e-4 voxels
+# relative to the largest latent: float32 positions 4800 voxels away are known to 5e-4 voxels
+FAR = 3e-3
 SMALL = dict(encoder=EncoderSettings(rank=8, anchors=64), noise=0.3)
-KINDS = {"surface": lambda **settings: SurfaceMap(**{**SMALL, **settings}),
-         "property": lambda **settings: PropertyMap("rgb", 3, **{"voxel_size": 0.05, **SMALL, **settings})}
+KINDS = {
+    "surface": lambda **settings: SurfaceMap(**{**SMALL, **settings}),
+    "property": lambda **settings: PropertyMap(
+        "rgb", 3, **{"voxel_size": 0.05, **SMALL, **settings}
+    ),
+}
 
 
 def frames() -> list:
     """Three overlapping clouds, one of them across the origin and one with voxels of its own."""
-    return [rough(0, 1200), moved(rough(1, 900), (0.05, 0.02, 0)), moved(rough(2, 600), (-0.07, 0.3, 0.1))]
+    return [
+        rough(0, 1200),
+        moved(rough(1, 900), (0.05, 0.02, 0)),
+        moved(rough(2, 600), (-0.07, 0.3, 0.1)),
+    ]
 
 
 def probes() -> np.ndarray:
@@ -36,7 +52,11 @@ def probes() -> np.ndarray:
 
 def answers(target) -> tuple:
     """What a map decodes: values and validity as bytes."""
-    values, valid = target.sdf(probes()) if isinstance(target, SurfaceMap) else target.query(probes(), return_valid=True)
+    values, valid = (
+        target.sdf(probes())
+        if isinstance(target, SurfaceMap)
+        else target.query(probes(), return_valid=True)
+    )
     return values.tobytes(), valid.tobytes(), valid.mean()
 
 
@@ -76,18 +96,24 @@ def test_N3_the_order_of_frames_does_not_matter(kind, fused):
     assert_close(integrated(kind.new(), (c, a, b)), fused, ORDER)
 
 
-def test_M8_going_on_after_save_and_load_equals_going_on_and_a_refused_cloud_leaves_no_trace(kind, fused, tmp_path):
+def test_M8_going_on_after_save_and_load_equals_going_on_and_a_refused_cloud_leaves_no_trace(
+    kind, fused, tmp_path
+):
     a, b, c = frames()
     integrated(kind.new(), (a, b)).save(tmp_path / "map")
     resumed = load_map(tmp_path / "map")
-    bad = cloud_of(np.vstack([c.points[:500], [[1e9, 0, 0]]]), c.normals[:501], rgb=c.attributes["rgb"][:501])
+    bad = cloud_of(
+        np.vstack([c.points[:500], [[1e9, 0, 0]]]), c.normals[:501], rgb=c.attributes["rgb"][:501]
+    )
     with pytest.raises(OutOfRange):
         resumed.integrate(bad)
     resumed.integrate(c)
     assert content(resumed) == content(fused) and answers(resumed) == answers(fused)
 
 
-def test_fusing_twice_doubles_weights_and_keeps_latents_and_merging_equals_integrating(kind, fused, tmp_path):
+def test_fusing_twice_doubles_weights_and_keeps_latents_and_merging_equals_integrating(
+    kind, fused, tmp_path
+):
     a, b, c = frames()
     once = integrated(kind.new(), [a])
     once.save(tmp_path / "a")
@@ -97,7 +123,9 @@ def test_fusing_twice_doubles_weights_and_keeps_latents_and_merging_equals_integ
     np.testing.assert_array_equal(after.keys, before.keys)
     np.testing.assert_array_equal(after.weights, 2 * before.weights)
     np.testing.assert_array_equal(after.masks, before.masks)
-    np.testing.assert_allclose(after.latents, before.latents, atol=1e-6 * np.abs(before.latents).max())
+    np.testing.assert_allclose(
+        after.latents, before.latents, atol=1e-6 * np.abs(before.latents).max()
+    )
     merged = load_map(tmp_path / "a")
     merged.merge(integrated(kind.new(), (b, c)))
     assert_close(merged, fused, ORDER)
@@ -109,22 +137,32 @@ def test_M8_load_gives_identical_answers_and_files(kind, fused, tmp_path):
     loaded = load_map(tmp_path / "one")
     loaded.save(tmp_path / "three")
     assert len({(tmp_path / name).read_bytes() for name in ("one", "two", "three")}) == 1
-    assert type(loaded) is type(fused) and loaded.settings == fused.settings and len(loaded) == len(fused)
+    assert (
+        type(loaded) is type(fused)
+        and loaded.settings == fused.settings
+        and len(loaded) == len(fused)
+    )
     assert content(loaded) == content(fused)
     assert answers(loaded) == answers(fused) and 0.2 < answers(fused)[2] < 1
     if kind.name == "surface":
         ours, theirs = loaded.extract_mesh(3), fused.extract_mesh(3)
         assert len(ours.faces) > 0
-        assert all(getattr(ours, part).tobytes() == getattr(theirs, part).tobytes()
-                   for part in ("vertices", "faces", "normals"))
+        assert all(
+            getattr(ours, part).tobytes() == getattr(theirs, part).tobytes()
+            for part in ("vertices", "faces", "normals")
+        )
 
 
-def test_N5_another_process_with_another_number_of_threads_writes_the_same_bytes(kind, fused, tmp_path):
+def test_N5_another_process_with_another_number_of_threads_writes_the_same_bytes(
+    kind, fused, tmp_path
+):
     fused.save(tmp_path / "here")
-    script = (f"import sys; sys.path[:0] = {sys.path!r}\n"
-              f"import taichi_unifusion as uf; uf.init({DEVICE!r}, threads=1)\n"
-              f"from test_map_laws import KINDS, frames, integrated\n"
-              f"integrated(KINDS[{kind.name!r}](), frames()).save({str(tmp_path / 'there')!r})")
+    script = (
+        f"import sys; sys.path[:0] = {sys.path!r}\n"
+        f"import taichi_unifusion as uf; uf.init({DEVICE!r}, threads=1)\n"
+        f"from test_map_laws import KINDS, frames, integrated\n"
+        f"integrated(KINDS[{kind.name!r}](), frames()).save({str(tmp_path / 'there')!r})"
+    )
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
     assert (tmp_path / "there").read_bytes() == (tmp_path / "here").read_bytes()
 
@@ -133,7 +171,9 @@ def test_N5_another_process_with_another_number_of_threads_writes_the_same_bytes
 def test_a_point_outside_the_index_range_changes_nothing(fused, bad):
     before, cloud = content(fused), frames()[0]
     cloud.points[700, 1] = bad
-    with pytest.raises(OutOfRange, match="1 of 1200 points lie more than 410 m from the origin or are not finite"):
+    with pytest.raises(
+        OutOfRange, match="1 of 1200 points lie more than 410 m from the origin or are not finite"
+    ):
         fused.integrate(cloud)
     assert content(fused) == before
 
@@ -144,7 +184,10 @@ def test_an_empty_cloud_and_an_empty_map_change_nothing(kind, fused):
     fused.merge(kind.new())
     assert content(fused) == before
     untouched = kind.new()
-    assert untouched.integrate(empty).total_voxels == len(untouched) == 0 and answers(untouched)[2] == 0
+    assert (
+        untouched.integrate(empty).total_voxels == len(untouched) == 0
+        and answers(untouched)[2] == 0
+    )
 
 
 def test_F4_too_few_points_make_no_voxel(kind):
@@ -155,8 +198,13 @@ def test_F4_too_few_points_make_no_voxel(kind):
 
 
 def test_maps_of_different_settings_do_not_merge(kind, fused):
-    for other in (kind.new(voxel_size=0.04), kind.new(noise=0.4), kind.new(encoder=EncoderSettings(rank=8, anchors=65)),
-                  PropertyMap("other", 3, voxel_size=0.05, **SMALL), PropertyMap("rgb", 1, voxel_size=0.05, **SMALL)):
+    for other in (
+        kind.new(voxel_size=0.04),
+        kind.new(noise=0.4),
+        kind.new(encoder=EncoderSettings(rank=8, anchors=65)),
+        PropertyMap("other", 3, voxel_size=0.05, **SMALL),
+        PropertyMap("rgb", 1, voxel_size=0.05, **SMALL),
+    ):
         before = content(fused)
         with pytest.raises(InputError, match="merge: the maps differ"):
             fused.merge(other)
@@ -170,11 +218,15 @@ def border(kind):
 
 @pytest.fixture(scope="module")
 def shifted(kind):
-    """Copies of one cloud in one map, shifted by whole voxels of 1/16 m on a grid of 1/8192 m: exact in float32 up to 1 km."""
+    """Copies of one cloud in one map, shifted by whole voxels of 1/16 m on a grid of 1/8192 m:
+    exact in float32 up to 1 km.
+    """
     steps = np.array([(0, 0, 0), (37, -50, 12), (-4800, 4800, -4801), (4800, 4799, 3)])
     cloud = rough(5, 1000, voxel_size=1 / 16)
     cloud.points[:] = np.round(cloud.points * 8192) / 8192
-    return integrated(kind.new(voxel_size=1 / 16), [moved(cloud, step / 16) for step in steps]), steps
+    return integrated(
+        kind.new(voxel_size=1 / 16), [moved(cloud, step / 16) for step in steps]
+    ), steps
 
 
 def test_shifting_a_cloud_by_whole_voxels_shifts_the_map(kind, shifted):
@@ -186,10 +238,16 @@ def test_shifting_a_cloud_by_whole_voxels_shifts_the_map(kind, shifted):
     for step, part in zip(steps[1:], parts[1:], strict=True):
         np.testing.assert_array_equal(data.keys[part] - step, data.keys[parts[0]])
         one_sample = 1.0 if kind.name == "surface" else 0.0
-        np.testing.assert_allclose(data.weights[part], data.weights[parts[0]], rtol=moves_samples, atol=one_sample)
+        np.testing.assert_allclose(
+            data.weights[part], data.weights[parts[0]], rtol=moves_samples, atol=one_sample
+        )
         assert (data.masks[part] != data.masks[parts[0]]).mean() <= 5 * moves_samples
-        tolerance = FAR * (FLIPPED_LATENTS if kind.name == "surface" and np.abs(step).max() > 1000 else 1)
-        np.testing.assert_allclose(data.latents[part], data.latents[parts[0]], atol=tolerance * np.abs(data.latents).max())
+        tolerance = FAR * (
+            FLIPPED_LATENTS if kind.name == "surface" and np.abs(step).max() > 1000 else 1
+        )
+        np.testing.assert_allclose(
+            data.latents[part], data.latents[parts[0]], atol=tolerance * np.abs(data.latents).max()
+        )
 
 
 def last_points(side: int):
@@ -204,7 +262,11 @@ def last_points(side: int):
 def test_what_integrate_accepts_can_be_decoded_up_to_the_border_of_the_index_range(kind, border):
     for side in (1, -1):
         points = last_points(side).points
-        valid = border.sdf(points)[1] if kind.name == "surface" else border.query(points, return_valid=True)[1]
+        valid = (
+            border.sdf(points)[1]
+            if kind.name == "surface"
+            else border.query(points, return_valid=True)[1]
+        )
         assert np.abs(points[:, 0]).max() * 16 > 8190 and valid.mean() > 0.95, (side, valid.mean())
 
 
@@ -245,11 +307,17 @@ def test_strided_clouds_are_read_as_they_are(kind):
     target.integrate(a)
     after = target._grid.export()
     np.testing.assert_array_equal(after.weights, 2 * before.weights)
-    np.testing.assert_allclose(after.latents, before.latents, atol=1e-6 * np.abs(before.latents).max())
+    np.testing.assert_allclose(
+        after.latents, before.latents, atol=1e-6 * np.abs(before.latents).max()
+    )
 
 
 def test_a_map_of_another_runtime_is_refused(fused, monkeypatch, tmp_path):
     monkeypatch.setattr(runtime, "_runtime", runtime.Runtime("cpu", "another one"))
-    for use in (lambda: fused.integrate(frames()[0]), lambda: answers(fused), lambda: fused.save(tmp_path / "map")):
+    for use in (
+        lambda: fused.integrate(frames()[0]),
+        lambda: answers(fused),
+        lambda: fused.save(tmp_path / "map"),
+    ):
         with pytest.raises(RuntimeStateError, match="save maps first"):
             use()

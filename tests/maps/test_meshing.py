@@ -9,22 +9,23 @@ import pytest
 import reference
 from skimage.measure import marching_cubes
 
-from taichi_unifusion.maps import meshing
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.kernels import marching_cubes as kernels
-from taichi_unifusion.maps import SurfaceMap
+from taichi_unifusion.maps import SurfaceMap, meshing
 from taichi_unifusion.maps.meshing import drop_small_parts
 from taichi_unifusion.types import Mesh
 
-R = 4                  # samples a cube edge in these tests
+R = 4  # samples a cube edge in these tests
 VS = 0.05
-ALL = 0xFFFFFFFF       # support everywhere
-ROUNDING = 1e-6        # [m] float32 positions of a few voxels
-AREA = 0.002           # relative: other triangulations of the same crossings of a smooth field
+ALL = 0xFFFFFFFF  # support everywhere
+ROUNDING = 1e-6  # [m] float32 positions of a few voxels
+AREA = 0.002  # relative: other triangulations of the same crossings of a smooth field
 
 
 def cubes_of(field: np.ndarray, first=(0, 0, 0), keep=None):
-    """Cubes (keys, upper, samples) that carry a field (n R)^3 on the lattice, but those that `keep` (n, n, n) leaves out."""
+    """Cubes (keys, upper, samples) that carry a field (n R)^3 on the lattice, but those that `keep`
+    (n, n, n) leaves out.
+    """
     n = len(field) // R
     places = np.array([q for q in product(range(n), repeat=3) if keep is None or keep[q]])
     samples = [field[tuple(slice(R * i, R * i + R) for i in q)].reshape(-1) for q in places]
@@ -40,7 +41,11 @@ def march(field: np.ndarray, first=(0, 0, 0)):
 def assert_welded(vertices, faces) -> None:
     """No unreferenced vertices, none twice, no face with two equal corners."""
     assert faces.min() == 0 and len(np.unique(faces)) == len(vertices) == faces.max() + 1
-    assert (faces[:, 0] != faces[:, 1]).all() and (faces[:, 1] != faces[:, 2]).all() and (faces[:, 2] != faces[:, 0]).all()
+    assert (
+        (faces[:, 0] != faces[:, 1]).all()
+        and (faces[:, 1] != faces[:, 2]).all()
+        and (faces[:, 2] != faces[:, 0]).all()
+    )
 
 
 def assert_closed(vertices, faces) -> None:
@@ -53,14 +58,17 @@ def assert_closed(vertices, faces) -> None:
 
 def area_and_volume(vertices, faces) -> tuple[float, float]:
     a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, np.einsum("ni,ni->", a, np.cross(b, c)) / 6
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, np.einsum(
+        "ni,ni->", a, np.cross(b, c)
+    ) / 6
 
 
 # ---- Tables ----
 
+
 def triangles_of(case: int) -> np.ndarray:
     counts, _, table, _ = meshing.marching_cubes_tables()
-    return table[case, :3 * counts[case]].reshape(-1, 3)
+    return table[case, : 3 * counts[case]].reshape(-1, 3)
 
 
 def ends(e: int) -> tuple[int, int]:
@@ -72,7 +80,9 @@ def ends(e: int) -> tuple[int, int]:
 
 @pytest.mark.parametrize("case", range(256))
 def test_every_case_is_a_disc_bounded_by_the_cells_faces(case):
-    """Vertices on exactly the crossed edges; inner edges shared twice, in both directions; the border in the cell's faces."""
+    """Vertices on exactly the crossed edges; inner edges shared twice, in both directions; the
+    border in the cell's faces.
+    """
     triangles, flags = triangles_of(case), meshing.marching_cubes_tables()[1][case]
     crossed = {e for e in range(12) if (case >> ends(e)[0] & 1) != (case >> ends(e)[1] & 1)}
     assert set(triangles.flatten().tolist()) == crossed == {e for e in range(12) if flags >> e & 1}
@@ -100,12 +110,14 @@ def test_triangles_are_counter_clockwise_seen_from_in_front(case):
     a, b, c = np.moveaxis(middles[triangles_of(case)], 1, 0)
     behind = np.array([case >> o & 1 for o in range(8)], bool)
     forward = np.mean([meshing.STEPS[o] for o in np.flatnonzero(~behind)], axis=0) - np.mean(
-        [meshing.STEPS[o] for o in np.flatnonzero(behind)], axis=0)
+        [meshing.STEPS[o] for o in np.flatnonzero(behind)], axis=0
+    )
     area = np.cross(b - a, c - a).sum(axis=0)
     assert area @ forward > 0 or np.allclose(forward, 0) or np.allclose(area, 0)
 
 
 # ---- Kernels against their twins ----
+
 
 @pytest.fixture(scope="module")
 def patchy():
@@ -116,10 +128,12 @@ def patchy():
     keep = np.ones((2, 2, 2), bool)
     keep[1, 0, 1] = False
     keys, upper, samples = cubes_of(field, (-1, 5, 0), keep)
-    support = rng.integers(0, 2**32, (len(keys), 2), dtype=np.uint32) | rng.integers(0, 2**32, (len(keys), 2), dtype=np.uint32)
+    support = rng.integers(0, 2**32, (len(keys), 2), dtype=np.uint32) | rng.integers(
+        0, 2**32, (len(keys), 2), dtype=np.uint32
+    )
     whole = np.full((2 * R + 1,) * 3, reference.UNKNOWN)
     whole[:-1, :-1, :-1] = field
-    whole[R:2 * R, :R, R:2 * R] = reference.UNKNOWN
+    whole[R : 2 * R, :R, R : 2 * R] = reference.UNKNOWN
     return keys, upper, samples, support, whole
 
 
@@ -128,7 +142,9 @@ def twin_cases(patchy) -> np.ndarray:
     cases = np.zeros((2 * R,) * 3, int)
     for key, mask in zip(keys - (-1, 5, 0), reference.unpack_masks(support), strict=True):
         block = tuple(slice(R * k, R * k + R + 1) for k in key)
-        cases[tuple(slice(R * k, R * k + R) for k in key)] = reference.classify_cells(whole[block], mask.reshape(4, 4, 4), R)
+        cases[tuple(slice(R * k, R * k + R) for k in key)] = reference.classify_cells(
+            whole[block], mask.reshape(4, 4, 4), R
+        )
     return cases
 
 
@@ -137,7 +153,9 @@ def classified(patchy):
     counts, flags, table, edge_table = meshing.marching_cubes_tables()
     cases, edges = np.empty(samples.shape, np.uint8), np.zeros(samples.shape, np.int32)
     triangles = np.empty(len(keys), np.int32)
-    kernels.classify_cells(R, upper, support, samples, counts, edge_table, flags, cases, edges, triangles)
+    kernels.classify_cells(
+        R, upper, support, samples, counts, edge_table, flags, cases, edges, triangles
+    )
     return cases, edges, triangles
 
 
@@ -155,7 +173,11 @@ def test_classify_cells_and_count_vertices_equal_their_twins(patchy):
     np.testing.assert_array_equal(lattice(patchy, cases), twin)
     assert len(np.unique(twin)) > 50
     crossed = reference.crossed_edges(twin)
-    assert {(*at, d) for d in range(3) for at in map(tuple, np.argwhere(lattice(patchy, edges) >> d & 1).tolist())} == crossed
+    assert {
+        (*at, d)
+        for d in range(3)
+        for at in map(tuple, np.argwhere(lattice(patchy, edges) >> d & 1).tolist())
+    } == crossed
     np.testing.assert_array_equal(triangles, meshing.marching_cubes_tables()[0][cases].sum(axis=1))
     vertices = np.empty(len(cases), np.int32)
     kernels.count_vertices(edges, vertices)
@@ -164,19 +186,32 @@ def test_classify_cells_and_count_vertices_equal_their_twins(patchy):
 
 
 def test_place_vertices_and_emit_triangles_equal_their_twins(patchy):
-    """One vertex on every crossed edge, where the field is zero; every cell's triangles join the vertices of its own edges."""
+    """One vertex on every crossed edge, where the field is zero; every cell's triangles join the
+    vertices of its own edges.
+    """
     keys, upper, samples, support, whole = patchy
     vertices, faces = meshing._march(keys, upper, support, samples, R, VS)
     cases = twin_cases(patchy)
     first = np.array([-1, 5, 0])
-    place = {edge: reference.place_vertices(whole, edge, R, first, VS) for edge in reference.crossed_edges(cases)}
+    place = {
+        edge: reference.place_vertices(whole, edge, R, first, VS)
+        for edge in reference.crossed_edges(cases)
+    }
     found = sorted(map(tuple, vertices.astype(float).tolist()))
-    np.testing.assert_allclose(found, sorted(map(tuple, np.array(list(place.values())).tolist())), atol=ROUNDING)
+    np.testing.assert_allclose(
+        found, sorted(map(tuple, np.array(list(place.values())).tolist())), atol=ROUNDING
+    )
     edge_table, wanted = meshing.marching_cubes_tables()[3], []
     for cell in np.argwhere(cases):
         for triangle in triangles_of(cases[tuple(cell)]):
-            wanted.append(np.concatenate([place[(*(cell + edge_table[e, :3]).tolist(), int(edge_table[e, 3]))]
-                                          for e in triangle]))
+            wanted.append(
+                np.concatenate(
+                    [
+                        place[(*(cell + edge_table[e, :3]).tolist(), int(edge_table[e, 3]))]
+                        for e in triangle
+                    ]
+                )
+            )
     wanted, emitted = np.array(wanted), vertices[faces].reshape(-1, 9)
     assert wanted.shape == emitted.shape
     nearest = np.abs(wanted[:, None] - emitted[None]).max(axis=2).argmin(axis=1)
@@ -189,10 +224,15 @@ def test_sum_normals_equals_its_twin(patchy):
     vertices, faces = meshing._march(keys, upper, support, samples, R, VS)
     sums, per_area = np.zeros((len(vertices), 3), np.int32), meshing.NORMAL_UNIT * (R / VS) ** 2
     kernels.sum_normals(vertices, faces, per_area, sums)
-    np.testing.assert_allclose(sums / per_area, reference.sum_normals(vertices.astype(float), faces), atol=1e-4 * (VS / R) ** 2)
+    np.testing.assert_allclose(
+        sums / per_area,
+        reference.sum_normals(vertices.astype(float), faces),
+        atol=1e-4 * (VS / R) ** 2,
+    )
 
 
 # ---- Meshes ----
+
 
 @pytest.mark.parametrize("seed", range(3))
 def test_random_fields_give_closed_surfaces(seed):
@@ -215,17 +255,23 @@ def test_smooth_fields_agree_with_scikit_image(first):
     theirs, their_faces, *_ = marching_cubes(field.astype(np.float32), 0.0, spacing=[VS / R] * 3)
     theirs = theirs + (np.array(first) - 0.5) * VS
     assert len(theirs) == len(vertices)
-    np.testing.assert_allclose(np.sort(vertices, axis=0), np.sort(theirs, axis=0), atol=5 * ROUNDING)
+    np.testing.assert_allclose(
+        np.sort(vertices, axis=0), np.sort(theirs, axis=0), atol=5 * ROUNDING
+    )
     ours = area_and_volume(vertices, faces)
     area, volume = area_and_volume(theirs, their_faces)
-    assert ours[0] == pytest.approx(area, rel=AREA) and ours[1] == pytest.approx(abs(volume), rel=AREA)
+    assert ours[0] == pytest.approx(area, rel=AREA) and ours[1] == pytest.approx(
+        abs(volume), rel=AREA
+    )
 
 
 def test_upper_cubes_are_found_by_key():
     keys = meshing.unique_rows(np.random.default_rng(0).integers(-3, 3, (60, 3)) + (8000, -8000, 0))
     rows = {key: n for n, key in enumerate(map(tuple, keys.tolist()))}
     assert sorted(rows) == list(rows)
-    wanted = [[rows.get(tuple((key + step).tolist()), -1) for step in meshing.STEPS] for key in keys]
+    wanted = [
+        [rows.get(tuple((key + step).tolist()), -1) for step in meshing.STEPS] for key in keys
+    ]
     np.testing.assert_array_equal(meshing._upper_cubes(keys), wanted)
 
 
@@ -241,7 +287,9 @@ def test_resolutions_out_of_range_are_refused(resolution):
 
 
 def test_join_parts_equals_its_twin():
-    """Random triangles over many vertices, in several parts: every vertex ends with the first vertex of its part."""
+    """Random triangles over many vertices, in several parts: every vertex ends with the first
+    vertex of its part.
+    """
     rng = np.random.default_rng(5)
     faces = rng.integers(0, 400, (230, 3)).astype(np.int32)
     part, changed = np.arange(400, dtype=np.int32), np.ones(1, np.int32)
@@ -256,7 +304,12 @@ def test_small_parts_are_dropped_and_the_rest_is_untouched():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     vertices = np.concatenate([0.01 * square, square + 2])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
-    mesh = Mesh(vertices, faces, np.tile(np.float32([0, 0, 1]), (8, 1)), {"x": np.arange(8, dtype=np.float32)[:, None]})
+    mesh = Mesh(
+        vertices,
+        faces,
+        np.tile(np.float32([0, 0, 1]), (8, 1)),
+        {"x": np.arange(8, dtype=np.float32)[:, None]},
+    )
     large = drop_small_parts(mesh, 0.001)
     np.testing.assert_array_equal(large.vertices, vertices[4:])
     np.testing.assert_array_equal(large.faces, faces[:2])

@@ -7,17 +7,21 @@ import pytest
 from scenes import cloud_of, rough
 
 from taichi_unifusion import PointCloud, PropertyMap, load_map
-from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.errors import CapacityError, InputError
 from taichi_unifusion.maps import PropertyGroup
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.frame_blocks import FrameBlocks
 from taichi_unifusion.maps.property_group import group_maps
 
-SAME = 2e-5  # relative to values of the size of 3: another width of the right side may be summed in another order
+# relative to values of the size of 3: another width of the right side may be summed in another
+# order
+SAME = 2e-5
 CHANNELS = {"one": 1, "rgb": 3}
 SMALL = {"voxel_size": 0.05, "encoder": EncoderSettings(rank=4)}  # compiles in half the time
-SETTINGS = [{"sampling": "cells", "prior": "zero", "fusion": "mean", **SMALL},
-            {"sampling": "points", "prior": "mean", "fusion": "information", **SMALL}]
+SETTINGS = [
+    {"sampling": "cells", "prior": "zero", "fusion": "mean", **SMALL},
+    {"sampling": "points", "prior": "mean", "fusion": "information", **SMALL},
+]
 
 
 def maps_of(**settings) -> list[PropertyMap]:
@@ -25,7 +29,11 @@ def maps_of(**settings) -> list[PropertyMap]:
 
 
 def without(cloud: PointCloud, name: str) -> PointCloud:
-    return cloud_of(cloud.points, cloud.normals, **{key: v for key, v in cloud.attributes.items() if key != name})
+    return cloud_of(
+        cloud.points,
+        cloud.normals,
+        **{key: v for key, v in cloud.attributes.items() if key != name},
+    )
 
 
 def with_holes(cloud: PointCloud, name: str) -> PointCloud:
@@ -74,10 +82,17 @@ def test_maps_of_a_group_are_saved_loaded_and_merged_alone(tmp_path):
 
 
 def test_maps_are_grouped_by_their_settings():
-    maps = [PropertyMap("one", 1, voxel_size=0.1), PropertyMap("five", 5), PropertyMap("rgb", 3, voxel_size=0.1)]
+    maps = [
+        PropertyMap("one", 1, voxel_size=0.1),
+        PropertyMap("five", 5),
+        PropertyMap("rgb", 3, voxel_size=0.1),
+    ]
     groups = group_maps(maps)
     assert [[each.name for each in group.maps] for group in groups] == [["one", "rgb"], ["five"]]
-    assert groups[0].name_in(rough(1)) == "one + rgb" and groups[0].name_in(without(rough(1), "one")) == "rgb"
+    assert (
+        groups[0].name_in(rough(1)) == "one + rgb"
+        and groups[0].name_in(without(rough(1), "one")) == "rgb"
+    )
     with pytest.raises(InputError, match="property group: 'one' and 'five' have other settings"):
         PropertyGroup(maps[:2])
     empty = cloud_of(np.empty((0, 3)), np.empty((0, 3)), one=np.empty((0, 1)), rgb=np.empty((0, 3)))
@@ -110,8 +125,11 @@ def test_values_are_summed_in_cells_to_the_bit_as_one_array_is(parts):
         blocks = FrameBlocks(grid, 2 + parts, with_positions=False)
         blocks.touch(cloud.points, 0.05)
         blocks.bin(cloud.points, values if together else [np.hstack(values)], 0.05)
-        order = np.lexsort(blocks.keys.to_numpy()[:blocks.count].T)  # blocks are numbered as threads come
-        sums.append([array.to_numpy()[:blocks.count][order] for array in (blocks.counts, blocks.sums)])
+        # blocks are numbered as threads come
+        order = np.lexsort(blocks.keys.to_numpy()[: blocks.count].T)
+        sums.append(
+            [array.to_numpy()[: blocks.count][order] for array in (blocks.counts, blocks.sums)]
+        )
     assert sums[0][0].sum() == len(cloud)
     for one, together in zip(*sums, strict=True):
         np.testing.assert_array_equal(one, together)

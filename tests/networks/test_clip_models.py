@@ -1,4 +1,6 @@
-"""CLIP and SigLIP through transformers: small random models, saved by the test and loaded as a user's would be."""
+"""CLIP and SigLIP through transformers: small random models, saved by the test and loaded as a
+user's would be.
+"""
 
 from __future__ import annotations
 
@@ -8,29 +10,53 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch: pip install 'taichi-unifusion[clip]'")
-transformers = pytest.importorskip("transformers", reason="needs transformers: pip install 'taichi-unifusion[clip]'")
+transformers = pytest.importorskip(
+    "transformers", reason="needs transformers: pip install 'taichi-unifusion[clip]'"
+)
 
 from taichi_unifusion import Frame, PinholeCamera  # noqa: E402
 from taichi_unifusion.errors import FileError, FrameError, InputError  # noqa: E402
-from taichi_unifusion.networks import clip
-from taichi_unifusion.language import feature_image, make_image_encoder, make_text_encoder  # noqa: E402
+
+# noqa: E402
+from taichi_unifusion.language import feature_image, make_image_encoder, make_text_encoder
 from taichi_unifusion.language.prompts import embed  # noqa: E402
+from taichi_unifusion.networks import clip
 from taichi_unifusion.networks.tokenizer import _BYTE_LETTERS  # noqa: E402
 
 UNIT = 1e-5
 BATCHED = 1e-4  # sums in another order
 PATCH = 8
-TEXT = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=2, num_attention_heads=2, vocab_size=600,
-            max_position_embeddings=20, bos_token_id=1, eos_token_id=2, pad_token_id=2)
-VISION = dict(hidden_size=32, intermediate_size=48, num_hidden_layers=3, num_attention_heads=2, image_size=64, patch_size=PATCH)
+TEXT = dict(
+    hidden_size=32,
+    intermediate_size=48,
+    num_hidden_layers=2,
+    num_attention_heads=2,
+    vocab_size=600,
+    max_position_embeddings=20,
+    bos_token_id=1,
+    eos_token_id=2,
+    pad_token_id=2,
+)
+VISION = dict(
+    hidden_size=32,
+    intermediate_size=48,
+    num_hidden_layers=3,
+    num_attention_heads=2,
+    image_size=64,
+    patch_size=PATCH,
+)
 
 
 def save_tokenizer(folder) -> None:
     letters = [letter + end for letter in _BYTE_LETTERS.values() for end in ("", "</w>")]
     tokens = dict.fromkeys(["!", "<|startoftext|>", "<|endoftext|>", *letters, "so", "fa</w>"])
-    (folder / "vocab.json").write_text(json.dumps({token: number for number, token in enumerate(tokens)}))
+    (folder / "vocab.json").write_text(
+        json.dumps({token: number for number, token in enumerate(tokens)})
+    )
     (folder / "merges.txt").write_text("#version: 0.2\ns o\nf a</w>\n")
-    transformers.CLIPTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt")).save_pretrained(folder)
+    transformers.CLIPTokenizer(
+        str(folder / "vocab.json"), str(folder / "merges.txt")
+    ).save_pretrained(folder)
 
 
 @pytest.fixture(scope="module", params=["clip", "siglip"])
@@ -39,10 +65,15 @@ def folder(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("models") / request.param
     torch.manual_seed(0)
     if request.param == "clip":
-        model = transformers.CLIPModel(transformers.CLIPConfig(projection_dim=24, text_config=TEXT, vision_config=VISION))
+        model = transformers.CLIPModel(
+            transformers.CLIPConfig(projection_dim=24, text_config=TEXT, vision_config=VISION)
+        )
     else:
-        model = transformers.SiglipModel(transformers.SiglipConfig(text_config={**TEXT, "projection_size": 32},
-                                                                   vision_config=VISION))
+        model = transformers.SiglipModel(
+            transformers.SiglipConfig(
+                text_config={**TEXT, "projection_size": 32}, vision_config=VISION
+            )
+        )
     for parameter in model.parameters():  # as initialised, a layer hardly changes anything
         parameter.data += 0.1 * torch.randn_like(parameter)
     model.save_pretrained(folder)
@@ -52,7 +83,11 @@ def folder(request, tmp_path_factory):
 
 def frame(color) -> Frame:
     height, width = color.shape[:2]
-    return Frame(np.ones((height, width), np.float32), PinholeCamera(width, height, 50, 50, width / 2, height / 2), color=color)
+    return Frame(
+        np.ones((height, width), np.float32),
+        PinholeCamera(width, height, 50, 50, width / 2, height / 2),
+        color=color,
+    )
 
 
 def picture(seed=0, height=48, width=64):
@@ -64,7 +99,10 @@ def test_dense_features_have_the_shape_of_the_image(folder):
     found = feature_image(encoder, frame(picture()))
     texts = make_text_encoder(f"clip:{folder}", device="cpu").text_features(["a sofa", "b", "c"])
     assert found.shape == (12, 16, texts.shape[1]) and texts.shape[0] == 3
-    assert np.abs(np.linalg.norm(found, axis=2) - 1).max() < UNIT and np.abs(np.linalg.norm(texts, axis=1) - 1).max() < UNIT
+    assert (
+        np.abs(np.linalg.norm(found, axis=2) - 1).max() < UNIT
+        and np.abs(np.linalg.norm(texts, axis=1) - 1).max() < UNIT
+    )
 
 
 def test_dense_features_lie_at_their_pixels(folder):
@@ -74,7 +112,8 @@ def test_dense_features_lie_at_their_pixels(folder):
     plain = encoder.image_features(frame(color))
     for row, column in ((5, 9), (1, 14)):
         changed = color.copy()
-        changed[4 * row:4 * row + 4, 4 * column:4 * column + 4] = (255, 0, 60)  # a patch is 4 x 4 pixels of the frame
+        # a patch is 4 x 4 pixels of the frame
+        changed[4 * row : 4 * row + 4, 4 * column : 4 * column + 4] = (255, 0, 60)
         change = np.linalg.norm(encoder.image_features(frame(changed)) - plain, axis=2)
         assert np.unravel_index(change.argmax(), change.shape) == (row, column)
 
@@ -95,9 +134,17 @@ def test_a_batch_gives_what_each_gives_alone(folder):
     model = make_text_encoder(f"clip:{folder}", device="cpu")
     words = [f"word {chr(97 + i % 26)}{i}" for i in range(2 * clip.BATCH + 3)]
     some = [0, 17, 34]
-    assert np.abs(model.text_features(words)[some] - model.text_features([words[i] for i in some])).max() < BATCHED
+    assert (
+        np.abs(
+            model.text_features(words)[some] - model.text_features([words[i] for i in some])
+        ).max()
+        < BATCHED
+    )
     images = np.stack([model.normalized(picture(seed), 64, 48) for seed in range(3)])
-    assert np.abs(model.dense_features(images)[1] - model.dense_features(images[1:2])[0]).max() < BATCHED
+    assert (
+        np.abs(model.dense_features(images)[1] - model.dense_features(images[1:2])[0]).max()
+        < BATCHED
+    )
     assert embed(model, ["sofa"]).shape == (1, model.text_features(["sofa"]).shape[1])
 
 
@@ -108,14 +155,18 @@ def test_half_precision_is_used_on_a_gpu_alone(folder):
 
 
 def test_a_pooled_dense_network_knows_its_own_head(folder):
-    """For one single patch, attending to itself alone is what attention does: dense and pooled agree for SigLIP's head."""
+    """For one single patch, attending to itself alone is what attention does: dense and pooled
+    agree for SigLIP's head.
+    """
     model = make_text_encoder(f"clip:{folder}", device="cpu")
     if model.kind != "siglip":
         pytest.skip("CLIP pools at a token of its own")
     image = model.normalized(picture(), PATCH, PATCH)[None]
     dense = model.dense_features(image)
     with torch.inference_mode():
-        pooled = model.model.vision_model(torch.from_numpy(image), interpolate_pos_encoding=True).pooler_output.numpy()
+        pooled = model.model.vision_model(
+            torch.from_numpy(image), interpolate_pos_encoding=True
+        ).pooler_output.numpy()
     assert dense.shape[:3] == (1, 1, 1) and np.abs(dense[0, 0, 0] - pooled[0]).max() < BATCHED
 
 
@@ -130,4 +181,5 @@ def test_what_is_no_model_is_said(tmp_path, folder):
             make_image_encoder(f"clip:{folder}", **options)
     with pytest.raises(FrameError, match="no colour"):
         make_image_encoder(f"clip:{folder}", device="cpu").image_features(
-            Frame(np.ones((4, 4), np.float32), PinholeCamera(4, 4, 4, 4, 2, 2)))
+            Frame(np.ones((4, 4), np.float32), PinholeCamera(4, 4, 4, 4, 2, 2))
+        )

@@ -8,12 +8,19 @@ import hashlib
 import cv2
 import numpy as np
 import pytest
-from tiny_networks import color_transform, edge_detector, mean_of_channels, not_a_number, open_shape, write_network
+from tiny_networks import (
+    color_transform,
+    edge_detector,
+    mean_of_channels,
+    not_a_number,
+    open_shape,
+    write_network,
+)
 
 from taichi_unifusion import Frame, PinholeCamera
 from taichi_unifusion.errors import FileError, FrameError, InputError, MissingDependency
-from taichi_unifusion.properties import make_property
 from taichi_unifusion.networks.image_network import IMAGENET_MEAN, IMAGENET_STD
+from taichi_unifusion.properties import make_property
 
 pytest.importorskip("onnxruntime", reason="networks are run by onnxruntime, extra 'models'")
 
@@ -26,7 +33,11 @@ SWAP = [[0, 0, 1], [0, 1, 0], [1, 0, 0]]  # red for blue
 
 def frame_of(color: np.ndarray) -> Frame:
     height, width = color.shape[:2]
-    return Frame(np.ones((height, width), np.float32), PinholeCamera(width, height, 40, 40, width / 2, height / 2), color)
+    return Frame(
+        np.ones((height, width), np.float32),
+        PinholeCamera(width, height, 40, 40, width / 2, height / 2),
+        color,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +53,22 @@ def slow() -> np.ndarray:
 
 
 def test_an_edge_detector_gives_saliency(tmp_path, colors):
-    made = make_property(f"saliency=onnx:{edge_detector(tmp_path / 'edges.onnx')},mean=0/0/0,std=1/1/1")
+    made = make_property(
+        f"saliency=onnx:{edge_detector(tmp_path / 'edges.onnx')},mean=0/0/0,std=1/1/1"
+    )
     image = made.image(frame_of(colors))
     grey = np.float32(colors).mean(axis=2) / 255
-    wanted = np.tanh(4 * np.abs(cv2.filter2D(grey, -1, np.float32([[0, -1, 0], [-1, 4, -1], [0, -1, 0]]),
-                                             borderType=cv2.BORDER_CONSTANT)))
+    wanted = np.tanh(
+        4
+        * np.abs(
+            cv2.filter2D(
+                grey,
+                -1,
+                np.float32([[0, -1, 0], [-1, 4, -1], [0, -1, 0]]),
+                borderType=cv2.BORDER_CONSTANT,
+            )
+        )
+    )
     assert image.shape == (HEIGHT, WIDTH, 1) and image.dtype == np.float32
     np.testing.assert_allclose(image[..., 0], wanted, atol=10 * ROUNDED)
 
@@ -58,7 +80,9 @@ def test_the_input_is_normalised_as_imagenet_is_unless_told_otherwise(tmp_path, 
     np.testing.assert_allclose(image[..., 0], 1 / (1 + np.exp(-mean)), atol=ROUNDED)
     stretched = make_property(f"saliency=onnx:{file},activation=minmax").image(frame_of(colors))
     assert stretched.min() == 0 and stretched.max() == 1
-    with pytest.raises(InputError, match=r"runs from -\S+ to \S+, which is no saliency.*activation=sigmoid"):
+    with pytest.raises(
+        InputError, match=r"runs from -\S+ to \S+, which is no saliency.*activation=sigmoid"
+    ):
         make_property(f"saliency=onnx:{file}").image(frame_of(colors))
 
 
@@ -83,9 +107,13 @@ def test_the_range_of_an_output_is_told_and_checked(tmp_path, colors):
     file = color_transform(tmp_path / "same.onnx", np.eye(3))
     image = make_property(f"style=onnx:{file},scale=1,output_scale=1").image(frame_of(colors))
     np.testing.assert_allclose(image, colors / 255, atol=ROUNDED)
-    with pytest.raises(InputError, match="reaches 1, which does not fit a range of 0 to 255; say output_scale=1"):
+    with pytest.raises(
+        InputError, match="reaches 1, which does not fit a range of 0 to 255; say output_scale=1"
+    ):
         make_property(f"style=onnx:{file},scale=1").image(frame_of(colors))
-    with pytest.raises(InputError, match="reaches 255, which does not fit a range of 0 to 1; say output_scale=255"):
+    with pytest.raises(
+        InputError, match="reaches 255, which does not fit a range of 0 to 1; say output_scale=255"
+    ):
         make_property(f"style=onnx:{file},output_scale=1").image(frame_of(colors))
 
 
@@ -111,17 +139,37 @@ def test_one_channel_may_come_in_several_shapes(tmp_path, colors, output_shape):
 
 
 def test_half_precision_and_bytes_go_in(tmp_path, colors):
-    half = write_network(tmp_path / "half.onnx", [("Cast", ["image"], ["result"], {"to": 1})], {}, open_shape(3), open_shape(3),
-                         input_type=10)
-    assert np.abs(make_property(f"style=onnx:{half}").image(frame_of(colors)) - colors / 255).max() < 1e-3  # 10 bits
-    byte = write_network(tmp_path / "byte.onnx", [("Cast", ["image"], ["result"], {"to": 1})], {}, open_shape(3), open_shape(3),
-                         input_type=2)
-    np.testing.assert_allclose(make_property(f"style=onnx:{byte}").image(frame_of(colors)), colors / 255, atol=ROUNDED)
+    half = write_network(
+        tmp_path / "half.onnx",
+        [("Cast", ["image"], ["result"], {"to": 1})],
+        {},
+        open_shape(3),
+        open_shape(3),
+        input_type=10,
+    )
+    # 10 bits
+    assert (
+        np.abs(make_property(f"style=onnx:{half}").image(frame_of(colors)) - colors / 255).max()
+        < 1e-3
+    )
+    byte = write_network(
+        tmp_path / "byte.onnx",
+        [("Cast", ["image"], ["result"], {"to": 1})],
+        {},
+        open_shape(3),
+        open_shape(3),
+        input_type=2,
+    )
+    np.testing.assert_allclose(
+        make_property(f"style=onnx:{byte}").image(frame_of(colors)), colors / 255, atol=ROUNDED
+    )
 
 
 def test_X4_a_network_that_gives_no_number_costs_the_frame_this_property(tmp_path, colors):
     made = make_property(f"style=onnx:{not_a_number(tmp_path / 'nan.onnx')}")
-    with pytest.raises(FrameError, match=r"property 'style', frame 0: .*nan.onnx gives 100% NaN or infinite values"):
+    with pytest.raises(
+        FrameError, match=r"property 'style', frame 0: .*nan.onnx gives 100% NaN or infinite values"
+    ):
         made.image(frame_of(colors))
 
 
@@ -132,9 +180,11 @@ def test_X1_a_model_that_is_missing_damaged_or_another_is_said(tmp_path):
         make_property(f"saliency=onnx:{tmp_path / 'none.onnx'}")
     right = hashlib.sha256(data).hexdigest()
     make_property(f"saliency=onnx:{file},sha256={right.upper()}")
-    with pytest.raises(FileError, match=f"has the SHA-256 {right}, not 00; download the model again"):
+    with pytest.raises(
+        FileError, match=f"has the SHA-256 {right}, not 00; download the model again"
+    ):
         make_property(f"saliency=onnx:{file},sha256=00")
-    file.write_bytes(data[:len(data) // 2])
+    file.write_bytes(data[: len(data) // 2])
     with pytest.raises(FileError, match="edges.onnx: not an ONNX model that onnxruntime can run"):
         make_property(f"saliency=onnx:{file}")
     file.write_text("nothing of the kind")
@@ -144,27 +194,52 @@ def test_X1_a_model_that_is_missing_damaged_or_another_is_said(tmp_path):
 
 def test_a_model_of_another_kind_is_said(tmp_path, colors):
     with pytest.raises(InputError, match=r"is \[1, 4, 8, 8\] tensor\(float\), not one RGB image"):
-        make_property(f"saliency=onnx:{mean_of_channels(tmp_path / 'four.onnx', [1, 4, 8, 8], [1, 1, 8, 8])}")
-    two = write_network(tmp_path / "two.onnx", [("Mul", ["image", "gain"], ["result"], {})], {}, open_shape(3), open_shape(3),
-                        more_inputs=["gain"])
+        make_property(
+            f"saliency=onnx:{mean_of_channels(tmp_path / 'four.onnx', [1, 4, 8, 8], [1, 1, 8, 8])}"
+        )
+    two = write_network(
+        tmp_path / "two.onnx",
+        [("Mul", ["image", "gain"], ["result"], {})],
+        {},
+        open_shape(3),
+        open_shape(3),
+        more_inputs=["gain"],
+    )
     with pytest.raises(InputError, match=r"takes 2 inputs \(image, gain\), not one image"):
         make_property(f"style=onnx:{two}")
     three = color_transform(tmp_path / "three.onnx", np.eye(3))
-    with pytest.raises(InputError, match=r"'result' is \(1, 3, 32, 48\) float32, not an image of 1 channel; outputs: result"):
+    with pytest.raises(
+        InputError,
+        match=r"'result' is \(1, 3, 32, 48\) float32, not an image of 1 channel; outputs: result",
+    ):
         make_property(f"saliency=onnx:{three}").image(frame_of(colors))
     with pytest.raises(InputError, match="has no output 'mask'; outputs: result"):
         make_property(f"saliency=onnx:{three},output=mask")
-    blocky = write_network(tmp_path / "blocky.onnx", [("Reshape", ["image", "shape"], ["result"], {})],
-                           {"shape": np.array([1, 3, 64, 64])}, open_shape(3), [1, 3, 64, 64])
-    with pytest.raises(InputError, match=r"blocky.onnx: fails on an image of 48x32; .*say size=WIDTHxHEIGHT"):
+    blocky = write_network(
+        tmp_path / "blocky.onnx",
+        [("Reshape", ["image", "shape"], ["result"], {})],
+        {"shape": np.array([1, 3, 64, 64])},
+        open_shape(3),
+        [1, 3, 64, 64],
+    )
+    with pytest.raises(
+        InputError, match=r"blocky.onnx: fails on an image of 48x32; .*say size=WIDTHxHEIGHT"
+    ):
         make_property(f"style=onnx:{blocky}").image(frame_of(colors))
 
 
-@pytest.mark.parametrize(("settings", "told"), [
-    ("scale=0", "scale above 0"), ("std=0/1/1", "three positive stds"), ("mean=0.5/0.5", "three means"),
-    ("size=4x4", "size: must lie in 8..8192 pixels, got 4x4"), ("size=64", "size: expected WIDTHxHEIGHT, got '64'"),
-    ("order=rbg", "order: 'rbg' is unknown, choose one of rgb, bgr"), ("device=gpu", "device: 'gpu' is unknown"),
-])
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ("scale=0", "scale above 0"),
+        ("std=0/1/1", "three positive stds"),
+        ("mean=0.5/0.5", "three means"),
+        ("size=4x4", "size: must lie in 8..8192 pixels, got 4x4"),
+        ("size=64", "size: expected WIDTHxHEIGHT, got '64'"),
+        ("order=rbg", "order: 'rbg' is unknown, choose one of rgb, bgr"),
+        ("device=gpu", "device: 'gpu' is unknown"),
+    ],
+)
 def test_settings_that_do_not_fit(tmp_path, settings, told):
     file = mean_of_channels(tmp_path / "mean.onnx", open_shape(3), open_shape(1))
     with pytest.raises(InputError, match=told):

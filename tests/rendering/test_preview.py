@@ -15,14 +15,23 @@ from taichi_unifusion.types import Mesh, PinholeCamera, Trajectory
 
 cv2 = pytest.importorskip("cv2")
 
-DATA = Path(os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+DATA = Path(
+    os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")
+)
 CAMERA = PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5)
-DEPTH_TOLERANCE = 1e-5   # relative: depth is stored as float32
-EDGE_BAND = 1e-5         # barycentric: pixels so near an edge may go to either side
-LEVELS = 2               # of 255: rounding of colours in float32
-MIXED = 0.005            # share of pixels on the edge of two colours that may look like a third (blue and green: cyan)
-RED, GREEN, BLUE, YELLOW, CYAN, WHITE = ((0.8, 0.1, 0.1), (0.1, 0.7, 0.1), (0.1, 0.1, 0.8), (0.8, 0.8, 0.1), (0.1, 0.7, 0.7),
-                                         (0.8, 0.8, 0.8))
+DEPTH_TOLERANCE = 1e-5  # relative: depth is stored as float32
+EDGE_BAND = 1e-5  # barycentric: pixels so near an edge may go to either side
+LEVELS = 2  # of 255: rounding of colours in float32
+# share of pixels on the edge of two colours that may look like a third (blue and green: cyan)
+MIXED = 0.005
+RED, GREEN, BLUE, YELLOW, CYAN, WHITE = (
+    (0.8, 0.1, 0.1),
+    (0.1, 0.7, 0.1),
+    (0.1, 0.1, 0.8),
+    (0.8, 0.8, 0.1),
+    (0.1, 0.7, 0.7),
+    (0.8, 0.8, 0.8),
+)
 
 
 def looking(eye, target, up=(0, 0, 1)) -> np.ndarray:
@@ -35,26 +44,44 @@ def looking(eye, target, up=(0, 0, 1)) -> np.ndarray:
 
 
 def quad(corners, color, steps: int = 1) -> Mesh:
-    """A rectangle of 2 steps^2 triangles from 4 corners, counter-clockwise seen from the drawn side."""
+    """A rectangle of 2 steps^2 triangles from 4 corners, counter-clockwise seen from the drawn
+    side.
+    """
     a, b, _, d = np.asarray(corners, float)
     s = np.linspace(0, 1, steps + 1)
     vertices = (a + s[:, None, None] * (b - a) + s[None, :, None] * (d - a)).reshape(-1, 3)
     index = np.arange((steps + 1) ** 2).reshape(steps + 1, steps + 1)
-    p, q, r, t = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
+    p, q, r, t = (
+        index[:-1, :-1].ravel(),
+        index[1:, :-1].ravel(),
+        index[1:, 1:].ravel(),
+        index[:-1, 1:].ravel(),
+    )
     faces = np.concatenate([np.stack([p, q, r], axis=1), np.stack([p, r, t], axis=1)])
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), None,
-                {"color": np.tile(np.float32(color), (len(vertices), 1))})
+    return Mesh(
+        vertices.astype(np.float32),
+        faces.astype(np.int32),
+        None,
+        {"color": np.tile(np.float32(color), (len(vertices), 1))},
+    )
 
 
 def join(*meshes: Mesh) -> Mesh:
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-    return Mesh(np.concatenate([m.vertices for m in meshes]),
-                np.concatenate([m.faces + start for m, start in zip(meshes, starts, strict=False)]).astype(np.int32), None,
-                {"color": np.concatenate([m.attributes["color"] for m in meshes])})
+    return Mesh(
+        np.concatenate([m.vertices for m in meshes]),
+        np.concatenate([m.faces + start for m, start in zip(meshes, starts, strict=False)]).astype(
+            np.int32
+        ),
+        None,
+        {"color": np.concatenate([m.attributes["color"] for m in meshes])},
+    )
 
 
 def room(steps: int = 4) -> Mesh:
-    """A 4 x 3 x 2 m room seen from within: red wall at +x, green -x, blue +y, yellow -y, white floor, cyan ceiling."""
+    """A 4 x 3 x 2 m room seen from within: red wall at +x, green -x, blue +y, yellow -y, white
+    floor, cyan ceiling.
+    """
     x, y, z = 2.0, 1.5, 2.0
     return join(
         quad([(x, -y, 0), (x, -y, z), (x, y, z), (x, y, 0)], RED, steps),
@@ -69,7 +96,9 @@ def room(steps: int = 4) -> Mesh:
 def share_of(image: np.ndarray, color) -> float:
     """Share of the pixels, background left out, with nearly the hue of `color`."""
     pixels = image.reshape(-1, 3).astype(float)
-    alike = pixels @ (np.array(color) / np.linalg.norm(color)) > 0.99 * np.linalg.norm(pixels, axis=1)
+    alike = pixels @ (np.array(color) / np.linalg.norm(color)) > 0.99 * np.linalg.norm(
+        pixels, axis=1
+    )
     return float((alike & drawn(image).ravel()).mean())
 
 
@@ -79,9 +108,14 @@ def drawn(image: np.ndarray) -> np.ndarray:
 
 
 def is_like(pixel, color) -> bool:
-    """Whether a pixel has the hue of `color` and, under soft light, not much less than its brightness."""
+    """Whether a pixel has the hue of `color` and, under soft light, not much less than its
+    brightness.
+    """
     pixel, color = np.asarray(pixel, float) / 255, np.asarray(color)
-    return bool(pixel @ color > 0.99 * np.linalg.norm(pixel) * np.linalg.norm(color) and 0.6 < pixel.sum() / color.sum() < 1.1)
+    return bool(
+        pixel @ color > 0.99 * np.linalg.norm(pixel) * np.linalg.norm(color)
+        and 0.6 < pixel.sum() / color.sum() < 1.1
+    )
 
 
 def rasterize(vertices, faces, T_world_camera, near):
@@ -91,24 +125,41 @@ def rasterize(vertices, faces, T_world_camera, near):
 
     runtime.current()
     nearest = np.zeros((CAMERA.height, CAMERA.width), np.int64)
-    kernel(vertices, faces, 0, np.ascontiguousarray(CAMERA.matrix @ np.linalg.inv(T_world_camera)[:3]), near, nearest)
+    kernel(
+        vertices,
+        faces,
+        0,
+        np.ascontiguousarray(CAMERA.matrix @ np.linalg.inv(T_world_camera)[:3]),
+        near,
+        nearest,
+    )
     depth = (nearest >> 32).astype(np.int32).view(np.float32)
-    return np.where(nearest == EMPTY, 0, depth), np.where(nearest == EMPTY, -1, nearest & 0xFFFFFFFF)
+    return np.where(nearest == EMPTY, 0, depth), np.where(
+        nearest == EMPTY, -1, nearest & 0xFFFFFFFF
+    )
 
 
 def ray_cast(vertices, faces, T_world_camera, near):
-    """What `rasterize` must give, by intersecting every ray with every triangle in float64; and pixels near some edge."""
-    v, u = np.mgrid[:CAMERA.height, :CAMERA.width]
-    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1).reshape(-1, 3)
+    """What `rasterize` must give, by intersecting every ray with every triangle in float64; and
+    pixels near some edge.
+    """
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.stack(
+        [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1
+    ).reshape(-1, 3)
     local = (vertices.astype(float) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     depth, unsure = np.full(len(rays), np.inf), np.zeros(len(rays), bool)
     for a, b, c in local[faces]:
         n = np.cross(b - a, c - a)
         z = (n @ a) / (rays @ n)
         p = rays * z[:, None]
-        weights = np.stack([np.cross(q - p, r - p) @ n for q, r in ((b, c), (c, a), (a, b))], axis=1) / (n @ n)
+        weights = np.stack(
+            [np.cross(q - p, r - p) @ n for q, r in ((b, c), (c, a), (a, b))], axis=1
+        ) / (n @ n)
         hit = (rays @ n < 0) & (z >= near) & (weights.min(axis=1) >= 0)
-        unsure |= (rays @ n < 0) & (z > 0) & (np.abs(weights).min(axis=1) < EDGE_BAND) | (np.abs(z - near) < EDGE_BAND)
+        unsure |= (rays @ n < 0) & (z > 0) & (np.abs(weights).min(axis=1) < EDGE_BAND) | (
+            np.abs(z - near) < EDGE_BAND
+        )
         depth = np.where(hit & (z < depth), z, depth)
     return np.where(np.isinf(depth), 0, depth).reshape(u.shape), unsure.reshape(u.shape)
 
@@ -116,16 +167,22 @@ def ray_cast(vertices, faces, T_world_camera, near):
 # The kernel
 
 
-@pytest.mark.parametrize(("count", "spread"), [(1000, 0.3), (100, 4.0)], ids=["small", "across the near plane and the border"])
+@pytest.mark.parametrize(
+    ("count", "spread"),
+    [(1000, 0.3), (100, 4.0)],
+    ids=["small", "across the near plane and the border"],
+)
 def test_rasterize_equals_ray_casting(count, spread):
     rng = np.random.default_rng(3)
     centers = rng.uniform((-3, -3, -2), (3, 3, 6), (count, 1, 3))
-    vertices = (centers + rng.normal(scale=spread, size=(count, 3, 3))).reshape(-1, 3).astype(np.float32)
+    vertices = (
+        (centers + rng.normal(scale=spread, size=(count, 3, 3))).reshape(-1, 3).astype(np.float32)
+    )
     faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
     T_world_camera = looking((0.2, -0.1, 0.3), (0.1, 0.4, 5), up=(0, -1, 0))
     depth, _ = rasterize(vertices, faces, T_world_camera, 0.4)
     expected, unsure = ray_cast(vertices, faces, T_world_camera, 0.4)
-    assert unsure.mean() < 0.05 and 0.2 < (expected > 0).mean()
+    assert unsure.mean() < 0.05 and (expected > 0).mean() > 0.2
     np.testing.assert_allclose(depth[~unsure], expected[~unsure], rtol=DEPTH_TOLERANCE)
 
 
@@ -155,8 +212,10 @@ def test_N5_same_mesh_gives_the_same_bytes():
 # Pictures of one view
 
 
-@pytest.mark.parametrize(("target", "color"), [((2, 0, 1), RED), ((-2, 0, 1), GREEN), ((0, 1.5, 1), BLUE),
-                                               ((0, -1.5, 1), YELLOW)])
+@pytest.mark.parametrize(
+    ("target", "color"),
+    [((2, 0, 1), RED), ((-2, 0, 1), GREEN), ((0, 1.5, 1), BLUE), ((0, -1.5, 1), YELLOW)],
+)
 def test_walls_have_their_colors(target, color):
     image = render_mesh(room(), View(CAMERA, looking((0, 0, 1), target)))
     assert is_like(image[24, 32], color)
@@ -165,7 +224,8 @@ def test_walls_have_their_colors(target, color):
 def test_up_is_up_and_right_is_right():
     image = render_mesh(room(), View(CAMERA, looking((-1.5, 0, 1), (2, 0, 1))))
     assert is_like(image[2, 32], CYAN) and is_like(image[-3, 32], WHITE)
-    assert is_like(image[24, 2], BLUE) and is_like(image[24, -3], YELLOW)  # y is left when one looks along x with z up
+    # y is left when one looks along x with z up
+    assert is_like(image[24, 2], BLUE) and is_like(image[24, -3], YELLOW)
 
 
 def test_near_things_hide_far_ones():
@@ -180,19 +240,27 @@ def test_near_things_hide_far_ones():
 def test_backs_are_not_drawn():
     outside = render_mesh(room(), View(CAMERA, looking((5, 0, 5), (0, 0, 0.5))))
     assert is_like(outside[24, 32], WHITE)  # the floor, through the ceiling and the red wall
-    assert share_of(outside, RED) == 0 and share_of(outside, CYAN) < MIXED and share_of(outside, GREEN) > 0.03
+    assert (
+        share_of(outside, RED) == 0
+        and share_of(outside, CYAN) < MIXED
+        and share_of(outside, GREEN) > 0.03
+    )
 
 
 def test_colors_are_interpolated_in_perspective():
-    mesh = quad([(-4, -1, 1), (-4, 1, 5), (4, 1, 5), (4, -1, 1)], RED)  # a slope: rows of pixels lie at constant depth
-    mesh = mesh.with_attribute("color", (mesh.vertices[:, 2:] - 1) / 4 * np.float32([0.5, 0.5, 0.5]) + 0.25)
+    # a slope: rows of pixels lie at constant depth
+    mesh = quad([(-4, -1, 1), (-4, 1, 5), (4, 1, 5), (4, -1, 1)], RED)
+    mesh = mesh.with_attribute(
+        "color", (mesh.vertices[:, 2:] - 1) / 4 * np.float32([0.5, 0.5, 0.5]) + 0.25
+    )
     image = render_mesh(mesh, View(CAMERA, np.eye(4)))
     rows = np.arange(6, 24)
     y = (rows - CAMERA.cy) / CAMERA.fy
     depth = 3 / (1 - 2 * y)  # of the plane z = 3 + 2 y
     expected = (depth - 1) / 4 * 0.5 + 0.25
     ratio = image[rows, 32, 0] / 255 / expected
-    np.testing.assert_allclose(ratio, ratio.mean(), rtol=0.03)  # light is constant there; 8 bits and half a pixel
+    # light is constant there; 8 bits and half a pixel
+    np.testing.assert_allclose(ratio, ratio.mean(), rtol=0.03)
 
 
 def test_corners_are_darker_than_open_walls():
@@ -204,7 +272,9 @@ def test_corners_are_darker_than_open_walls():
 
 def test_mesh_without_color_is_grey_and_shaded():
     mesh = room()
-    image = render_mesh(Mesh(mesh.vertices, mesh.faces), View(CAMERA, looking((0.3, 0.2, 1.0), (2, 1, 0.5)))).astype(int)
+    image = render_mesh(
+        Mesh(mesh.vertices, mesh.faces), View(CAMERA, looking((0.3, 0.2, 1.0), (2, 1, 0.5)))
+    ).astype(int)
     assert np.ptp(image, axis=2).max() <= LEVELS and np.ptp(image[..., 0]) > 30
 
 
@@ -212,14 +282,21 @@ def test_given_normals_equal_computed_ones_on_a_plane():
     wall = quad([(2, -2, 0), (2, -2, 2), (2, 2, 2), (2, 2, 0)], RED, 3)
     normals = np.tile(np.float32([-1, 0, 0]), (len(wall.vertices), 1))
     view = View(CAMERA, looking((0, 0, 1), (2, 0, 1)))
-    a, b = render_mesh(wall, view), render_mesh(Mesh(wall.vertices, wall.faces, normals, wall.attributes), view)
+    a, b = (
+        render_mesh(wall, view),
+        render_mesh(Mesh(wall.vertices, wall.faces, normals, wall.attributes), view),
+    )
     assert np.abs(a.astype(int) - b).max() <= LEVELS
 
 
 def test_nan_is_left_out():
     mesh = room()
     vertices, color = mesh.vertices.copy(), mesh.attributes["color"].copy()
-    wall = np.flatnonzero((mesh.vertices[:, 0] > 1.9) & np.isclose(color[:, 0], RED[0]) & np.isclose(color[:, 1], RED[1]))
+    wall = np.flatnonzero(
+        (mesh.vertices[:, 0] > 1.9)
+        & np.isclose(color[:, 0], RED[0])
+        & np.isclose(color[:, 1], RED[1])
+    )
     vertices[wall[12]] = np.nan  # the middle of the red wall
     color[wall[0]] = np.nan
     view = View(CAMERA, looking((0, 0, 1), (2, 0, 1)))
@@ -232,18 +309,24 @@ def test_nan_is_left_out():
 
 def orbit(count: int = 12) -> Trajectory:
     angles = np.linspace(0, 5, count)
-    poses = [looking((0.3 * np.cos(a), 0.3 * np.sin(a), 1.2), (2 * np.cos(a), 2 * np.sin(a), 0.8)) for a in angles]
+    poses = [
+        looking((0.3 * np.cos(a), 0.3 * np.sin(a), 1.2), (2 * np.cos(a), 2 * np.sin(a), 0.8))
+        for a in angles
+    ]
     return Trajectory(np.arange(float(count)), np.array(poses))
 
 
 def panels(path: Path, size: tuple[int, int]) -> list[np.ndarray]:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1]
     assert image.shape[0] == size[1] and image.dtype == np.uint8 and image.shape[2] == 3
-    return [image[:, :size[0]], image[:, -size[0]:]]
+    return [image[:, : size[0]], image[:, -size[0] :]]
 
 
-TURNS = {"z up": np.eye(3), "y down": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]]),
-         "tilted": looking((0, 0, 0), (1, 2, 3))[:3, :3]}
+TURNS = {
+    "z up": np.eye(3),
+    "y down": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]]),
+    "tilted": looking((0, 0, 0), (1, 2, 3))[:3, :3],
+}
 
 
 @pytest.mark.parametrize("turn", TURNS.values(), ids=TURNS.keys())
@@ -252,12 +335,18 @@ def test_preview_with_poses_looks_into_the_room_whatever_is_up(tmp_path, turn):
     T = np.eye(4)
     T[:3, :3] = turn
     turned = Mesh((mesh.vertices @ turn.T).astype(np.float32), mesh.faces, None, mesh.attributes)
-    render_preview(turned, tmp_path / "p.png", trajectory=Trajectory(trajectory.timestamps, T @ trajectory.T_world_camera),
-                   size=(160, 120))
+    render_preview(
+        turned,
+        tmp_path / "p.png",
+        trajectory=Trajectory(trajectory.timestamps, T @ trajectory.T_world_camera),
+        size=(160, 120),
+    )
     camera, overview = panels(tmp_path / "p.png", (160, 120))
     assert drawn(camera).mean() > 0.95  # from within, the room fills the picture
-    assert share_of(overview, WHITE) > 0.15 and share_of(overview, CYAN) < MIXED  # the floor is seen through the ceiling
-    assert sum(share_of(overview, color) > 0.01 for color in (RED, GREEN, BLUE, YELLOW)) == 2  # the two far walls
+    # the floor is seen through the ceiling
+    assert share_of(overview, WHITE) > 0.15 and share_of(overview, CYAN) < MIXED
+    # the two far walls
+    assert sum(share_of(overview, color) > 0.01 for color in (RED, GREEN, BLUE, YELLOW)) == 2
     rows = np.flatnonzero(drawn(overview).any(axis=1))
     assert rows[0] < 20 and rows[-1] > 100  # it is fitted into the picture, with a margin
     assert os.listdir(tmp_path) == ["p.png"]
@@ -265,8 +354,14 @@ def test_preview_with_poses_looks_into_the_room_whatever_is_up(tmp_path, turn):
 
 def test_preview_without_poses_shows_two_sides(tmp_path):
     render_preview(room(), tmp_path / "p.png", size=(160, 120))
-    seen = [{name for name, color in (("r", RED), ("g", GREEN), ("b", BLUE), ("y", YELLOW)) if share_of(panel, color) > 0.01}
-            for panel in panels(tmp_path / "p.png", (160, 120))]
+    seen = [
+        {
+            name
+            for name, color in (("r", RED), ("g", GREEN), ("b", BLUE), ("y", YELLOW))
+            if share_of(panel, color) > 0.01
+        }
+        for panel in panels(tmp_path / "p.png", (160, 120))
+    ]
     assert all(len(walls) == 2 for walls in seen) and seen[0] != seen[1]
 
 
@@ -290,7 +385,12 @@ def test_camera_view_keeps_clear_of_what_a_camera_is_close_to(tmp_path):
     """One camera has its nose at a blue board; the view is taken from one that sees the room."""
     board = quad([(-0.8, -1, 0), (-0.8, -1, 2), (-0.8, 1, 2), (-0.8, 1, 0)], BLUE, 8)
     poses = np.array([looking((-1, 0, 1), (2, 0, 1)), looking((-1, 0, 1), (-2, 0, 0.9))])
-    render_preview(join(room(8), board), tmp_path / "p.png", trajectory=Trajectory(np.arange(2.0), poses), size=(160, 120))
+    render_preview(
+        join(room(8), board),
+        tmp_path / "p.png",
+        trajectory=Trajectory(np.arange(2.0), poses),
+        size=(160, 120),
+    )
     camera, _ = panels(tmp_path / "p.png", (160, 120))
     assert is_like(camera[50, 80], GREEN)
 
@@ -303,7 +403,11 @@ def test_preview_errors_say_what_is_wrong(tmp_path):
         (Mesh(mesh.vertices * 0, mesh.faces), {}, "no area"),
         (Mesh(mesh.vertices, mesh.faces + len(mesh.vertices)), {}, "but the mesh has"),
         (mesh.with_attribute("color", np.zeros(len(mesh.vertices))), {}, "'color' must be"),
-        (mesh, {"views": ["overvew"]}, "did you mean 'overview'.*There are camera, overview, opposite"),
+        (
+            mesh,
+            {"views": ["overvew"]},
+            "did you mean 'overview'.*There are camera, overview, opposite",
+        ),
         (mesh, {"views": ["camera"]}, "needs a trajectory"),
     )
     for bad, options, message in cases:
@@ -321,20 +425,36 @@ def test_preview_of_a_real_frame(tmp_path):
     folder = DATA / "7scenes-redkitchen"
     if not folder.is_dir():
         pytest.skip(f"no data at {folder}; set UNIFUSION_DATA")
-    depth = cv2.imread(str(folder / "frame-000000.depth.png"), cv2.IMREAD_UNCHANGED).astype(np.float32)
+    depth = cv2.imread(str(folder / "frame-000000.depth.png"), cv2.IMREAD_UNCHANGED).astype(
+        np.float32
+    )
     color = cv2.imread(str(folder / "frame-000000.color.jpg"), cv2.IMREAD_COLOR)[..., ::-1]
     T_world_camera = np.loadtxt(folder / "frame-000000.pose.txt")
     z = np.where(depth == 65535, 0, depth / 1000)[::2, ::2]
     v, u = 2.0 * np.mgrid[:240, :320]
     points = np.stack([(u - 320) / 585 * z, (v - 240) / 585 * z, z], axis=-1).reshape(-1, 3)
     index = np.arange(z.size).reshape(z.shape)
-    a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel()
+    a, b, c, d = (
+        index[:-1, :-1].ravel(),
+        index[:-1, 1:].ravel(),
+        index[1:, :-1].ravel(),
+        index[1:, 1:].ravel(),
+    )
     faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
     corner = z.ravel()[faces]
     faces = faces[(corner.min(axis=1) > 0.3) & (np.ptp(corner, axis=1) < 0.05 * corner.min(axis=1))]
-    mesh = Mesh((points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]).astype(np.float32), faces.astype(np.int32), None,
-                {"color": (color[::2, ::2].reshape(-1, 3) / 255).astype(np.float32)})
-    render_preview(mesh, tmp_path / "p.png", trajectory=Trajectory(np.zeros(1), T_world_camera[None]), size=(320, 240))
+    mesh = Mesh(
+        (points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]).astype(np.float32),
+        faces.astype(np.int32),
+        None,
+        {"color": (color[::2, ::2].reshape(-1, 3) / 255).astype(np.float32)},
+    )
+    render_preview(
+        mesh,
+        tmp_path / "p.png",
+        trajectory=Trajectory(np.zeros(1), T_world_camera[None]),
+        size=(320, 240),
+    )
     camera, overview = panels(tmp_path / "p.png", (320, 240))
     assert drawn(camera).mean() > 0.4 and drawn(overview).mean() > 0.1
     cupboards = camera[70:110, 50:90].reshape(-1, 3).mean(axis=0)

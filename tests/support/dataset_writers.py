@@ -1,4 +1,6 @@
-"""Writes tiny recordings in every format, from the formats' public descriptions and independently of the loaders."""
+"""Writes tiny recordings in every format, from the formats' public descriptions and independently
+of the loaders.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,10 @@ START, PERIOD = 1305031453.25, 1 / 32  # [s] of time stamps, exact in binary
 class Sample:
     """One frame as it goes into a file."""
 
-    color: np.ndarray           # (H, W, 3) uint8 RGB
-    units: np.ndarray           # (H, W) uint16, with 0 and 65535 among them
+    color: np.ndarray  # (H, W, 3) uint8 RGB
+    units: np.ndarray  # (H, W) uint16, with 0 and 65535 among them
     T_world_camera: np.ndarray  # (4, 4)
-    timestamp: float            # [s]
+    timestamp: float  # [s]
 
     def metres(self, depth_scale: float) -> np.ndarray:
         """What a loader must return: (H, W) float32, 0 where there is no reading."""
@@ -96,9 +98,13 @@ def write_seven_scenes(folder: Path, samples: list[Sample]) -> Path:
 
 def write_replica(folder: Path, samples: list[Sample], images: str = "results") -> Path:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "traj.txt").write_text("\n".join(numbers(sample.T_world_camera) for sample in samples) + "\n")
-    (folder / "cam_params.json").write_text('{"camera": {"w": 16, "h": 12, "fx": 15.0, "fy": 14.0, "cx": 7.5, "cy": 5.5, '
-                                            '"scale": 6553.5}}')
+    (folder / "traj.txt").write_text(
+        "\n".join(numbers(sample.T_world_camera) for sample in samples) + "\n"
+    )
+    (folder / "cam_params.json").write_text(
+        '{"camera": {"w": 16, "h": 12, "fx": 15.0, "fy": 14.0, "cx": 7.5, "cy": 5.5, '
+        '"scale": 6553.5}}'
+    )
     for i, sample in enumerate(samples):
         write_image(folder / images / f"frame{i:06d}.png", sample.color)
         write_image(folder / images / f"depth{i:06d}.png", sample.units)
@@ -138,31 +144,60 @@ def write_scannet_flat(folder: Path, samples: list[Sample]) -> Path:
     for i, sample in enumerate(samples):
         (folder / f"frame-{i:06d}.depth.png").unlink()
         head = f"P5\n# data values are 16-bit each; depth shift is 1000\n{WIDTH} {HEIGHT}\n65535\n"
-        (folder / f"frame-{i:06d}.depth.pgm").write_bytes(head.encode() + sample.units.astype(">u2").tobytes())
-    (folder / "_info.txt").write_text("m_versionNumber = 4\nm_sensorName = StructureSensor\nm_depthShift = 1000\n"
-                                      "m_calibrationDepthIntrinsic = 15 0 7.5 0 0 14 5.5 0 0 0 1 0 0 0 0 1 \n")
+        (folder / f"frame-{i:06d}.depth.pgm").write_bytes(
+            head.encode() + sample.units.astype(">u2").tobytes()
+        )
+    (folder / "_info.txt").write_text(
+        "m_versionNumber = 4\nm_sensorName = StructureSensor\nm_depthShift = 1000\n"
+        "m_calibrationDepthIntrinsic = 15 0 7.5 0 0 14 5.5 0 0 0 1 0 0 0 0 1 \n"
+    )
     return folder
 
 
-def sens_bytes(samples: list[Sample], *, version: int = 4, name: bytes = b"StructureSensor", name_bytes: int | None = None,
-               frame_count: int | None = None, size: tuple[int, int] = (WIDTH, HEIGHT), color_compression: int = 1,
-               depth_compression: int = 1, color_bytes: int | None = None, depth_bytes: int | None = None) -> bytes:
+def sens_bytes(
+    samples: list[Sample],
+    *,
+    version: int = 4,
+    name: bytes = b"StructureSensor",
+    name_bytes: int | None = None,
+    frame_count: int | None = None,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    color_compression: int = 1,
+    depth_compression: int = 1,
+    color_bytes: int | None = None,
+    depth_bytes: int | None = None,
+) -> bytes:
     """A .sens file; the options write lies into its header or its records."""
     K = np.eye(4, dtype="<f4")
     K[:3, :3] = CAMERA.matrix
     out = [struct.pack("<IQ", version, len(name) if name_bytes is None else name_bytes), name]
     out += [matrix.astype("<f4").tobytes() for matrix in (np.eye(4), np.eye(4), K, np.eye(4))]
-    out.append(struct.pack("<iiIIIIf", color_compression, depth_compression, 2 * WIDTH, 2 * HEIGHT, *size, 1000.0))
+    out.append(
+        struct.pack(
+            "<iiIIIIf", color_compression, depth_compression, 2 * WIDTH, 2 * HEIGHT, *size, 1000.0
+        )
+    )
     out.append(struct.pack("<Q", len(samples) if frame_count is None else frame_count))
     for sample in samples:
         color = enlarged(sample.color)
-        color = color.tobytes() if color_compression == 0 else cv2.imencode(".png", color[..., ::-1])[1].tobytes()
+        color = (
+            color.tobytes()
+            if color_compression == 0
+            else cv2.imencode(".png", color[..., ::-1])[1].tobytes()
+        )
         depth = sample.units.astype("<u2").tobytes()
         depth = depth if depth_compression == 0 else zlib.compress(depth)
         stamp = round(sample.timestamp * 1e6)
         out.append(sample.T_world_camera.astype("<f4").tobytes())
-        out.append(struct.pack("<QQQQ", stamp - 5, stamp, len(color) if color_bytes is None else color_bytes,
-                               len(depth) if depth_bytes is None else depth_bytes))
+        out.append(
+            struct.pack(
+                "<QQQQ",
+                stamp - 5,
+                stamp,
+                len(color) if color_bytes is None else color_bytes,
+                len(depth) if depth_bytes is None else depth_bytes,
+            )
+        )
         out += [color, depth]
     out.append(struct.pack("<Q", 0))  # no IMU frames
     return b"".join(out)
@@ -177,8 +212,12 @@ def write_sens(folder: Path, samples: list[Sample]) -> Path:
 CAMERA_YAML = "width: 16\nheight: 12\nfx: 15.0\nfy: 14.0\ncx: 7.5\ncy: 5.5\n"
 
 
-def write_folder(folder: Path, samples: list[Sample], poses: str = "folder", depth: str = "png") -> Path:
-    """`poses`: "folder" (one file each), "rows" (16 numbers), "named" (name and quaternion) or "none"."""
+def write_folder(
+    folder: Path, samples: list[Sample], poses: str = "folder", depth: str = "png"
+) -> Path:
+    """`poses`: "folder" (one file each), "rows" (16 numbers), "named" (name and quaternion) or
+    "none".
+    """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "camera.yaml").write_text(CAMERA_YAML)
     (folder / "depth").mkdir()
@@ -193,7 +232,11 @@ def write_folder(folder: Path, samples: list[Sample], poses: str = "folder", dep
         for i, sample in enumerate(samples):
             (folder / "poses" / f"{i:06d}.txt").write_text(matrix_text(sample.T_world_camera))
     elif poses == "rows":
-        (folder / "poses.txt").write_text("\n".join(numbers(sample.T_world_camera) for sample in samples))
+        (folder / "poses.txt").write_text(
+            "\n".join(numbers(sample.T_world_camera) for sample in samples)
+        )
     elif poses == "named":
-        (folder / "poses.txt").write_text("\n".join(tum_row(s.T_world_camera, f"{i:06d}") for i, s in enumerate(samples)))
+        (folder / "poses.txt").write_text(
+            "\n".join(tum_row(s.T_world_camera, f"{i:06d}") for i, s in enumerate(samples))
+        )
     return folder

@@ -10,17 +10,36 @@ CAMERA = PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5)  # sees 1.6 x 1.2 m at 1 
 
 
 def mesh_of(vertices, faces, color=None) -> Mesh:
-    mesh = Mesh(np.array(vertices, np.float32).reshape(-1, 3), np.array(faces, np.int32).reshape(-1, 3))
-    return mesh if color is None else mesh.with_attribute("color", np.tile(np.float32(color), (len(mesh.vertices), 1)))
+    mesh = Mesh(
+        np.array(vertices, np.float32).reshape(-1, 3), np.array(faces, np.int32).reshape(-1, 3)
+    )
+    return (
+        mesh
+        if color is None
+        else mesh.with_attribute("color", np.tile(np.float32(color), (len(mesh.vertices), 1)))
+    )
 
 
 def rectangle(low, high, z: float, color=None, steps: int = 1) -> Mesh:
     """2 steps^2 triangles that fill low..high, (x, y) each, at height z."""
     x, y = (np.linspace(a, b, steps + 1) for a, b in zip(low, high, strict=True))
-    vertices = np.stack([*(g.ravel() for g in np.meshgrid(x, y, indexing="ij")), np.full((steps + 1) ** 2, float(z))], axis=1)
+    vertices = np.stack(
+        [
+            *(g.ravel() for g in np.meshgrid(x, y, indexing="ij")),
+            np.full((steps + 1) ** 2, float(z)),
+        ],
+        axis=1,
+    )
     index = np.arange((steps + 1) ** 2).reshape(steps + 1, steps + 1)
-    p, q, r, t = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
-    return mesh_of(vertices, np.concatenate([np.stack([p, q, r], axis=1), np.stack([p, r, t], axis=1)]), color)
+    p, q, r, t = (
+        index[:-1, :-1].ravel(),
+        index[1:, :-1].ravel(),
+        index[1:, 1:].ravel(),
+        index[:-1, 1:].ravel(),
+    )
+    return mesh_of(
+        vertices, np.concatenate([np.stack([p, q, r], axis=1), np.stack([p, r, t], axis=1)]), color
+    )
 
 
 def box(low, high) -> Mesh:
@@ -33,10 +52,14 @@ def box(low, high) -> Mesh:
 def joined(*meshes: Mesh) -> Mesh:
     """All triangles; attributes that all have."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    whole = mesh_of(np.concatenate([mesh.vertices for mesh in meshes]),
-                    np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]))
+    whole = mesh_of(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]),
+    )
     for name in set.intersection(*(set(mesh.attributes) for mesh in meshes)):
-        whole = whole.with_attribute(name, np.concatenate([mesh.attributes[name] for mesh in meshes]))
+        whole = whole.with_attribute(
+            name, np.concatenate([mesh.attributes[name] for mesh in meshes])
+        )
     return whole
 
 
@@ -47,9 +70,13 @@ def moved(mesh: Mesh, T) -> Mesh:
 
 
 def random_soup(count: int, seed: int, size: float = 0.5, slivers: bool = True) -> Mesh:
-    """Triangles scattered over a cube of 2 m, up to about `size` metres; every seventh of them may have no area."""
+    """Triangles scattered over a cube of 2 m, up to about `size` metres; every seventh of them may
+    have no area.
+    """
     rng = np.random.default_rng(seed)
-    corners = rng.uniform(-1, 1, (count, 1, 3)) + rng.normal(0, size, (count, 3, 3)) * rng.uniform(0.01, 1, (count, 1, 1))
+    corners = rng.uniform(-1, 1, (count, 1, 3)) + rng.normal(0, size, (count, 3, 3)) * rng.uniform(
+        0.01, 1, (count, 1, 1)
+    )
     if slivers:
         corners[::7, 2] = 0.5 * (corners[::7, 0] + corners[::7, 1])
     return mesh_of(corners, np.arange(3 * count))
@@ -75,5 +102,8 @@ def open3d_scene(mesh: Mesh):
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(np.ascontiguousarray(mesh.vertices)), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    scene.add_triangles(
+        o3d.core.Tensor(np.ascontiguousarray(mesh.vertices)),
+        o3d.core.Tensor(mesh.faces.astype(np.uint32)),
+    )
     return scene

@@ -1,7 +1,9 @@
-"""Slow float64 NumPy twins of the method (Eq. 3-19) and of the kernels, written from the paper and for reading only.
+"""Slow float64 NumPy twins of the method (Eq. 3-19) and of the kernels, written from the paper and
+for reading only.
 
-A twin has the name of the kernel that it mirrors; the kernels' scratch and launch arguments have no place here. A map is a
-dict from voxel index to `Voxel`; positions are in voxel units unless a comment says metres.
+A twin has the name of the kernel that it mirrors; the kernels' scratch and launch arguments have no
+place here. A map is a dict from voxel index to `Voxel`; positions are in voxel units unless a
+comment says metres.
 """
 
 from __future__ import annotations
@@ -13,13 +15,15 @@ from itertools import product
 
 import numpy as np
 
-CELLS = 4          # support and averaging cells per voxel edge
-UNKNOWN = 1e9      # signed distance where no voxel reaches
+CELLS = 4  # support and averaging cells per voxel edge
+UNKNOWN = 1e9  # signed distance where no voxel reaches
 CORNERS = np.array(list(product((0, 1), repeat=3)))
-FACE_CYCLES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))  # corners around each face
+# corners around each face
+FACE_CYCLES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 
 # ---- Kernel and position encoding: Eq. 9-15 ----
+
 
 def matern72(distance, length_scale):
     """Eq. 13 with sigma = 1."""
@@ -34,7 +38,9 @@ def kernel_matrix(a, b, length_scale):
 
 @dataclass(frozen=True)
 class Encoder:
-    """f_posi by Nystrom: eigenpairs of the anchors' kernel matrix, each sign such that the largest entry is positive."""
+    """f_posi by Nystrom: eigenpairs of the anchors' kernel matrix, each sign such that the largest
+    entry is positive.
+    """
 
     rank: int = 20
     anchors: int = 256
@@ -48,7 +54,7 @@ class Encoder:
     @cached_property
     def eigenpairs(self):
         values, vectors = np.linalg.eigh(kernel_matrix(self.points, self.points, self.length_scale))
-        top = np.argsort(values)[::-1][:self.rank]
+        top = np.argsort(values)[::-1][: self.rank]
         vectors = vectors[:, top]
         for i in range(self.rank):
             if vectors[np.abs(vectors[:, i]).argmax(), i] < 0:
@@ -75,6 +81,7 @@ def encode_gradients(encoder, t):
 
 # ---- Regression: Eq. 3, 6, 16-18 ----
 
+
 def gpr(X, Y, X_new, noise, length_scale):
     """Eq. 3: the exact Gaussian process."""
     K = kernel_matrix(X, X, length_scale) + noise * np.eye(len(X))
@@ -88,26 +95,35 @@ def regress_dual(P, Y, noise):
 
 def regress(P, W, Y, noise):
     """Eq. 6 as an l x l solve, row i of P and Y counting W[i] times."""
-    return np.linalg.solve(P.T @ (W[:, None] * P) + noise * np.eye(P.shape[1]), P.T @ (W[:, None] * Y))
+    return np.linalg.solve(
+        P.T @ (W[:, None] * P) + noise * np.eye(P.shape[1]), P.T @ (W[:, None] * Y)
+    )
 
 
 def encode_voxel(encoder, t, counts, targets, normals, noise, centered):
-    """F of one voxel; with `normals` Eq. 16-17, with `centered` the mean target is taken off and kept as a last row."""
+    """F of one voxel; with `normals` Eq. 16-17, with `centered` the mean target is taken off and
+    kept as a last row.
+    """
     P, W, Y = encoder(t), counts, targets
     mean = (W @ Y / W.sum())[None] if centered else np.zeros((1, Y.shape[1]))
     Y = Y - mean
     if normals is not None:
         gradient = 0.5 * encoder.gradient(t)  # by voxel units, as t moves by half a voxel a voxel
-        P, W, Y = np.vstack([P, *np.moveaxis(gradient, 1, 0)]), np.tile(W, 4), np.vstack([Y, *normals.T[:, :, None]])
+        P, W, Y = (
+            np.vstack([P, *np.moveaxis(gradient, 1, 0)]),
+            np.tile(W, 4),
+            np.vstack([Y, *normals.T[:, :, None]]),
+        )
     F = regress(P, W, Y, noise)
     return np.vstack([F, mean]) if centered else F
 
 
 # ---- Voxels, cells, surfels ----
 
+
 @dataclass
 class Voxel:
-    F: np.ndarray     # (l [+ 1], c)
+    F: np.ndarray  # (l [+ 1], c)
     w: float
     mask: np.ndarray  # (64,) support
 
@@ -138,8 +154,10 @@ def cell_number(cell):
 
 def bin_points(x, values):
     """Lattice cell -> (count, mean value, mean position)."""
-    return {cell: (len(n), values[n].mean(axis=0), x[n].mean(axis=0))
-            for cell, n in rows_by(np.floor(x * CELLS).astype(int)).items()}
+    return {
+        cell: (len(n), values[n].mean(axis=0), x[n].mean(axis=0))
+        for cell, n in rows_by(np.floor(x * CELLS).astype(int)).items()
+    }
 
 
 def surfels(x, normals):
@@ -156,7 +174,9 @@ def touch_surfel_samples(x, normals, offsets):
 
 
 def bin_surfel_samples(x, normals, offsets):
-    """Lattice cell -> (count, mean signed distance of its centre to the planes of the surfels that sample it, mean normal)."""
+    """Lattice cell -> (count, mean signed distance of its centre to the planes of the surfels that
+    sample it, mean normal).
+    """
     sums = defaultdict(lambda: np.zeros(5))
     for count, point, normal in surfels(x, normals):
         for a in offsets:
@@ -167,7 +187,9 @@ def bin_surfel_samples(x, normals, offsets):
 
 
 def mark_cells(counts, minimum):
-    """Voxel -> cells (64,) with `minimum` of the counts by lattice cell or half the mean of its occupied cells; 0 marks all."""
+    """Voxel -> cells (64,) with `minimum` of the counts by lattice cell or half the mean of its
+    occupied cells; 0 marks all.
+    """
     in_cells = defaultdict(lambda: np.zeros(CELLS**3))
     for cell, count in counts.items():
         in_cells[tuple(c // CELLS for c in cell)][cell_number(cell)] = count
@@ -176,33 +198,67 @@ def mark_cells(counts, minimum):
 
 
 def compact_cells(counts, sums):
-    """(M, 1 + c) for every occupied cell in order: root of its count, mean values times that; from (B, 64) and (B, 64, c)."""
-    rows = [[np.sqrt(counts[b, cell]), *(sums[b, cell] / np.sqrt(counts[b, cell]))]
-            for b, cell in product(*map(range, counts.shape)) if counts[b, cell]]
+    """(M, 1 + c) for every occupied cell in order: root of its count, mean values times that; from
+    (B, 64) and (B, 64, c).
+    """
+    rows = [
+        [np.sqrt(counts[b, cell]), *(sums[b, cell] / np.sqrt(counts[b, cell]))]
+        for b, cell in product(*map(range, counts.shape))
+        if counts[b, cell]
+    ]
     return np.array(rows)
 
 
 def unpack_masks(masks):
     """(N, 2) words, first cell in the highest bit -> (N, 64) bool."""
-    return np.unpackbits(np.ascontiguousarray(masks).astype(">u4").view(np.uint8), axis=1).astype(bool)
+    return np.unpackbits(np.ascontiguousarray(masks).astype(">u4").view(np.uint8), axis=1).astype(
+        bool
+    )
 
 
 # ---- Local maps of a frame, and their fusion ----
 
-def encode_points(encoder, samples, targets, *, normals=None, noise, minimum, centered=False, encode=encode_voxel):
-    """Voxel -> (F, w) from single samples, for every voxel whose doubled box holds at least `minimum` of them."""
+
+def encode_points(
+    encoder, samples, targets, *, normals=None, noise, minimum, centered=False, encode=encode_voxel
+):
+    """Voxel -> (F, w) from single samples, for every voxel whose doubled box holds at least
+    `minimum` of them.
+    """
     local = {}
     for key in rows_by((np.floor(samples - 0.5).astype(int)[:, None] + CORNERS).reshape(-1, 3)):
         t = (samples - key - 0.5) / 2
         inside = np.abs(t).max(axis=1) <= 0.5
         if inside.sum() >= minimum:
-            local[key] = encode(encoder, t[inside], np.ones(inside.sum()), targets[inside],
-                                None if normals is None else normals[inside], noise, centered), inside.sum()
+            local[key] = (
+                encode(
+                    encoder,
+                    t[inside],
+                    np.ones(inside.sum()),
+                    targets[inside],
+                    None if normals is None else normals[inside],
+                    noise,
+                    centered,
+                ),
+                inside.sum(),
+            )
     return local
 
 
-def encode_cells(encoder, cells, *, derivatives=False, noise, minimum, margin, centered=False, encode=encode_voxel):
-    """The same from cell averages (count, mean targets, mean normals), which lie at the cell centres."""
+def encode_cells(
+    encoder,
+    cells,
+    *,
+    derivatives=False,
+    noise,
+    minimum,
+    margin,
+    centered=False,
+    encode=encode_voxel,
+):
+    """The same from cell averages (count, mean targets, mean normals), which lie at the cell
+    centres.
+    """
     lattice = np.array(list(cells))
     counts = np.array([cell[0] for cell in cells.values()], float)
     targets, normals = (np.array([cell[i] for cell in cells.values()], float) for i in (1, 2))
@@ -212,8 +268,18 @@ def encode_cells(encoder, cells, *, derivatives=False, noise, minimum, margin, c
             offset = lattice - CELLS * np.array(key)
             near = ((offset >= -margin) & (offset < CELLS + margin)).all(axis=1)
             t = ((offset[near] + 0.5) / CELLS - 0.5) / 2
-            local[key] = encode(encoder, t, counts[near], targets[near], normals[near] if derivatives else None, noise,
-                                centered), counts[near].sum()
+            local[key] = (
+                encode(
+                    encoder,
+                    t,
+                    counts[near],
+                    targets[near],
+                    normals[near] if derivatives else None,
+                    noise,
+                    centered,
+                ),
+                counts[near].sum(),
+            )
     return local
 
 
@@ -224,22 +290,30 @@ def surface_frame(encoder, x, normals, settings, encode=encode_voxel):
     options = dict(noise=settings.noise, minimum=settings.min_points, encode=encode)
     if settings.sampling == "cells":
         cells = bin_surfel_samples(x, normals, steps)
-        local = encode_cells(encoder, cells, derivatives=derivatives, margin=settings.margin, **options)
+        local = encode_cells(
+            encoder, cells, derivatives=derivatives, margin=settings.margin, **options
+        )
         counts = {cell: value[0] for cell, value in cells.items()}
     else:
         samples = np.vstack([x + a * normals for a in steps])
         targets = np.repeat(steps, len(x))[:, None]
         slopes = np.tile(normals, (len(steps), 1)) if derivatives else None
         local = encode_points(encoder, samples, targets, normals=slopes, **options)
-        counts = {cell: len(n) for cell, n in rows_by(np.floor(samples * CELLS).astype(int)).items()}
+        counts = {
+            cell: len(n) for cell, n in rows_by(np.floor(samples * CELLS).astype(int)).items()
+        }
     masks = mark_cells(counts, settings.support_points)
     return {key: Voxel(F, w, masks[key]) for key, (F, w) in local.items()}
 
 
 def property_frame(encoder, x, values, settings, encode=encode_voxel):
     """Local property LIM of a frame (Eq. 18)."""
-    options = dict(noise=settings.noise, minimum=settings.min_points, centered=settings.prior == "mean",
-                   encode=encode)
+    options = dict(
+        noise=settings.noise,
+        minimum=settings.min_points,
+        centered=settings.prior == "mean",
+        encode=encode,
+    )
     cells = bin_points(x, values)
     if settings.sampling == "cells":
         local = encode_cells(encoder, cells, margin=settings.margin, **options)
@@ -255,36 +329,47 @@ def fuse(frames):
     for frame in frames:
         for key, new in frame.items():
             old = fused.get(key, Voxel(np.zeros_like(new.F), 0.0, np.zeros_like(new.mask)))
-            fused[key] = Voxel((old.F * old.w + new.F * new.w) / (old.w + new.w), old.w + new.w, old.mask | new.mask)
+            fused[key] = Voxel(
+                (old.F * old.w + new.F * new.w) / (old.w + new.w),
+                old.w + new.w,
+                old.mask | new.mask,
+            )
     return fused
 
 
 # ---- Decoding: Eq. 7 ----
 
+
 def find_neighbors(keys):
     """(B, 27) row of each neighbour of every key, -1 where there is none."""
     rows = {tuple(key): n for n, key in enumerate(np.asarray(keys).tolist())}
     steps = list(product((-1, 0, 1), repeat=3))
-    return np.array([[rows.get(tuple((key + step).tolist()), -1) for step in steps] for key in np.asarray(keys)])
+    return np.array(
+        [[rows.get(tuple((key + step).tolist()), -1) for step in steps] for key in np.asarray(keys)]
+    )
 
 
 def decode(encoder, voxel, t, centered):
     """f_dec(t, F), plus the prior mean."""
-    value = (encoder(t[None]) @ voxel.F[:encoder.rank])[0]
+    value = (encoder(t[None]) @ voxel.F[: encoder.rank])[0]
     return value + voxel.F[encoder.rank] if centered else value
 
 
 def nearest_voxel(voxels, point, reach):
-    """Key of the voxel with the nearest centre among those up to `reach` voxels away along every axis, or None."""
+    """Key of the voxel with the nearest centre among those up to `reach` voxels away along every
+    axis, or None.
+    """
     home = np.floor(point).astype(int)
     near = [key for key in voxels if np.abs(np.array(key) - home).max() <= reach]
     return min(near, key=lambda key: np.linalg.norm(point - np.array(key) - 0.5), default=None)
 
 
 def query_points(encoder, voxels, x, *, blend, centered=False, reach=0):
-    """Values (N, c) and validity (N,): tent-blended over the doubled voxels that contain a point, or from its own voxel only.
+    """Values (N, c) and validity (N,): tent-blended over the doubled voxels that contain a point,
+    or from its own voxel only.
 
-    Elsewhere the value is that of the nearest voxel within `reach` (0: none), at the nearest point of its doubled box.
+    Elsewhere the value is that of the nearest voxel within `reach` (0: none), at the nearest point
+    of its doubled box.
     """
     channels = next(iter(voxels.values())).F.shape[1]
     values, valid = np.zeros((len(x), channels)), np.zeros(len(x), bool)
@@ -301,12 +386,19 @@ def query_points(encoder, voxels, x, *, blend, centered=False, reach=0):
         if weight > 0:
             values[n], valid[n] = total / weight, True
         elif reach and (key := nearest_voxel(voxels, point, reach)):
-            values[n] = decode(encoder, voxels[key], np.clip((point - np.array(key) - 0.5) / 2, -0.5, 0.5), centered)
+            values[n] = decode(
+                encoder,
+                voxels[key],
+                np.clip((point - np.array(key) - 0.5) / 2, -0.5, 0.5),
+                centered,
+            )
     return values, valid
 
 
 def sdf_grid(encoder, voxels, corner, resolution):
-    """(R, R, R) signed distance at the samples of the cube that spans the centres of the eight voxels around a corner."""
+    """(R, R, R) signed distance at the samples of the cube that spans the centres of the eight
+    voxels around a corner.
+    """
     axes = [np.arange(resolution) / resolution - 0.5] * 3
     samples = corner + np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     values, valid = query_points(encoder, voxels, samples, blend=True)
@@ -314,26 +406,46 @@ def sdf_grid(encoder, voxels, corner, resolution):
 
 
 def tent_sum(voxels, corner, resolution):
-    """(R^3,) sum of the tent weights of the voxels that exist, at the same samples: 0 where none reaches."""
-    u = np.stack(np.meshgrid(*[np.arange(resolution) / resolution] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    return sum(np.prod(1 - np.abs(u - step), axis=1) for step in CORNERS if tuple((corner - 1 + step).tolist()) in voxels)
+    """(R^3,) sum of the tent weights of the voxels that exist, at the same samples: 0 where none
+    reaches.
+    """
+    u = np.stack(
+        np.meshgrid(*[np.arange(resolution) / resolution] * 3, indexing="ij"), axis=-1
+    ).reshape(-1, 3)
+    return sum(
+        np.prod(1 - np.abs(u - step), axis=1)
+        for step in CORNERS
+        if tuple((corner - 1 + step).tolist()) in voxels
+    )
 
 
 def corner_support(voxels, corner, closing):
-    """(4, 4, 4) cells of that cube that are supported or have `closing` supported ones among their 26 neighbours."""
-    supported = {tuple((CELLS * np.array(key) + np.unravel_index(n, [CELLS] * 3)).tolist())
-                 for key, voxel in voxels.items() for n in np.flatnonzero(voxel.mask)}
+    """(4, 4, 4) cells of that cube that are supported or have `closing` supported ones among their
+    26 neighbours.
+    """
+    supported = {
+        tuple((CELLS * np.array(key) + np.unravel_index(n, [CELLS] * 3)).tolist())
+        for key, voxel in voxels.items()
+        for n in np.flatnonzero(voxel.mask)
+    }
     first = CELLS * np.array(corner) - CELLS // 2
     near = [step for step in product((-1, 0, 1), repeat=3) if any(step)]
-    return np.array([tuple((first + at).tolist()) in supported
-                     or sum(tuple((first + at + step).tolist()) in supported for step in near) >= closing
-                     for at in product(range(CELLS), repeat=3)]).reshape([CELLS] * 3)
+    return np.array(
+        [
+            tuple((first + at).tolist()) in supported
+            or sum(tuple((first + at + step).tolist()) in supported for step in near) >= closing
+            for at in product(range(CELLS), repeat=3)
+        ]
+    ).reshape([CELLS] * 3)
 
 
 # ---- Marching cubes ----
 
+
 def classify_cells(field, support, resolution):
-    """Case (bit per corner behind the surface, x slowest) of every cell of a field (R+1)^3; 0 where unknown or unsupported."""
+    """Case (bit per corner behind the surface, x slowest) of every cell of a field (R+1)^3; 0 where
+    unknown or unsupported.
+    """
     cases = np.zeros([resolution] * 3, int)
     for ijk in product(range(resolution), repeat=3):
         corners = [field[tuple(np.add(ijk, step))] for step in CORNERS]
@@ -344,7 +456,9 @@ def classify_cells(field, support, resolution):
 
 
 def crossed_edges(cases):
-    """Edges (lower sample, axis) of the cells whose ends lie on different sides, for cases (R, R, R)."""
+    """Edges (lower sample, axis) of the cells whose ends lie on different sides, for cases (R, R,
+    R).
+    """
     edges = set()
     for ijk in product(*map(range, cases.shape)):
         for o, d in product(range(8), range(3)):
@@ -363,8 +477,17 @@ def place_vertices(field, edge, resolution, corner, voxel_size):
 
 
 def emit_triangles(case):
-    """Number of segments in which the surface of a case meets the cell's faces: half the crossings of the faces' borders."""
-    return sum((case >> cycle[k] & 1) != (case >> cycle[(k + 1) % 4] & 1) for cycle in FACE_CYCLES for k in range(4)) // 2
+    """Number of segments in which the surface of a case meets the cell's faces: half the crossings
+    of the faces' borders.
+    """
+    return (
+        sum(
+            (case >> cycle[k] & 1) != (case >> cycle[(k + 1) % 4] & 1)
+            for cycle in FACE_CYCLES
+            for k in range(4)
+        )
+        // 2
+    )
 
 
 def sum_normals(vertices, faces):
@@ -378,19 +501,26 @@ def sum_normals(vertices, faces):
 
 # ---- Images ----
 
+
 def clip_depth(depth, low, high):
     with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(depth) & (depth >= np.float32(low)) & (depth <= np.float32(high)), depth, np.float32(0))
+        return np.where(
+            np.isfinite(depth) & (depth >= np.float32(low)) & (depth <= np.float32(high)),
+            depth,
+            np.float32(0),
+        )
 
 
 def drop_flying_pixels(depth, jump, support):
-    """Inverse depth (H, W), 0 where fewer than `support` of the 8 neighbours belong to the same surface; borders have none."""
+    """Inverse depth (H, W), 0 where fewer than `support` of the 8 neighbours belong to the same
+    surface; borders have none.
+    """
     height, width = depth.shape
     inverse = np.zeros(depth.shape)
     for v, u in zip(*np.nonzero(depth)):
         close = 0
         if 0 < v < height - 1 and 0 < u < width - 1:
-            patch = depth[v - 1:v + 2, u - 1:u + 2]
+            patch = depth[v - 1 : v + 2, u - 1 : u + 2]
             close = int((np.abs(patch - depth[v, u]) <= np.float32(jump) * depth[v, u]).sum()) - 1
         if close >= support:
             inverse[v, u] = 1 / float(depth[v, u])
@@ -398,14 +528,20 @@ def drop_flying_pixels(depth, jump, support):
 
 
 def inverse_depth_slope(inverse, v, u, radius, jump):
-    """Slopes of 1/z by u and v, least squares over opposite pairs of pixels that both belong with the centre; squares found."""
+    """Slopes of 1/z by u and v, least squares over opposite pairs of pixels that both belong with
+    the centre; squares found.
+    """
     height, width = inverse.shape
     sums = np.zeros((2, 2))
     q = inverse[v, u]
     if radius <= v < height - radius and radius <= u < width - radius:
         for i, k in product(range(-radius, radius + 1), range(1, radius + 1)):
-            for axis, (ahead, behind) in enumerate(((inverse[v + i, u + k], inverse[v + i, u - k]),
-                                                    (inverse[v + k, u + i], inverse[v - k, u + i]))):
+            for axis, (ahead, behind) in enumerate(
+                (
+                    (inverse[v + i, u + k], inverse[v + i, u - k]),
+                    (inverse[v + k, u + i], inverse[v - k, u + i]),
+                )
+            ):
                 if max(abs(ahead - q), abs(behind - q)) < jump * q:
                     sums[axis] += k * (ahead - behind), 2 * k * k
     slopes = sums[:, 0] / np.maximum(sums[:, 1], 1)
@@ -413,7 +549,9 @@ def inverse_depth_slope(inverse, v, u, radius, jump):
 
 
 def estimate_normals(inverse, fx, fy, cx, cy, radius, jump, cos_max_angle):
-    """(H, W, 3) normals of the planes 1/z = a u + b v + c, towards the camera; quads of pixels on one surface share slopes."""
+    """(H, W, 3) normals of the planes 1/z = a u + b v + c, towards the camera; quads of pixels on
+    one surface share slopes.
+    """
     height, width = inverse.shape
     normals = np.zeros((height, width, 3))
     for top, left in product(range(0, height, 2), range(0, width, 2)):
@@ -427,7 +565,10 @@ def estimate_normals(inverse, fx, fy, cx, cy, radius, jump, cos_max_angle):
                 fitted_at = q
             if found >= 2 * radius**2:
                 ray = np.array([(u - cx) / fx, (v - cy) / fy, 1])
-                plane = np.array([slope_u * fx, slope_v * fy, q - slope_u * (u - cx) - slope_v * (v - cy)])  # plane . x = 1
+                # plane . x = 1
+                plane = np.array(
+                    [slope_u * fx, slope_v * fy, q - slope_u * (u - cx) - slope_v * (v - cy)]
+                )
                 plane /= np.linalg.norm(plane)
                 if plane @ ray / np.linalg.norm(ray) >= cos_max_angle:
                     normals[v, u] = -plane
@@ -442,7 +583,11 @@ def unproject(depth, normals, fx, fy, cx, cy):
     """Points, their normals and pixels, row by row."""
     v, u = np.nonzero(normals[..., 2])
     z = depth[v, u].astype(float)
-    return np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1), normals[v, u], np.stack([v, u], axis=1)
+    return (
+        np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1),
+        normals[v, u],
+        np.stack([v, u], axis=1),
+    )
 
 
 def sample_color(pixels, color):

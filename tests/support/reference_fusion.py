@@ -1,4 +1,6 @@
-"""Slow float64 twins of information fusion: the regression of a voxel over the samples of all frames (Eq. 6)."""
+"""Slow float64 twins of information fusion: the regression of a voxel over the samples of all
+frames (Eq. 6).
+"""
 
 from __future__ import annotations
 
@@ -11,17 +13,17 @@ from reference import Voxel
 
 @dataclass
 class Samples:
-    P: np.ndarray     # (n, l) features
-    W: np.ndarray     # (n,) points behind each
-    Y: np.ndarray     # (n, c) targets
-    points: float     # points in all, which is less than W's sum where normals are targets too
-    centered: bool    # a prior mean
+    P: np.ndarray  # (n, l) features
+    W: np.ndarray  # (n,) points behind each
+    Y: np.ndarray  # (n, c) targets
+    points: float  # points in all, which is less than W's sum where normals are targets too
+    centered: bool  # a prior mean
 
 
 @dataclass
 class Sums:
-    G: np.ndarray     # (l, l) P^T W P
-    r: np.ndarray     # (l, c [+ 1]) P^T W Y, and P^T W 1 for a prior mean
+    G: np.ndarray  # (l, l) P^T W P
+    r: np.ndarray  # (l, c [+ 1]) P^T W Y, and P^T W 1 for a prior mean
     mean: np.ndarray  # (c,) Y^T W 1
     w: float
 
@@ -31,7 +33,11 @@ def samples_of_voxel(encoder, t, counts, targets, normals, noise, centered):
     P, W, Y = encoder(t), counts, targets
     if normals is not None:
         gradient = 0.5 * encoder.gradient(t)
-        P, W, Y = np.vstack([P, *np.moveaxis(gradient, 1, 0)]), np.tile(W, 4), np.vstack([Y, *normals.T[:, :, None]])
+        P, W, Y = (
+            np.vstack([P, *np.moveaxis(gradient, 1, 0)]),
+            np.tile(W, 4),
+            np.vstack([Y, *normals.T[:, :, None]]),
+        )
     return Samples(P, W, Y, counts.sum(), centered)
 
 
@@ -53,7 +59,11 @@ def regress_all(frames, noise):
         mean = (W @ Y / W.sum())[None] if parts[0].F.centered else np.zeros((1, Y.shape[1]))
         F = reference.regress(P, W, Y - mean, noise)
         mask = np.any([part.mask for part in parts], axis=0)
-        fused[key] = Voxel(np.vstack([F, mean]) if parts[0].F.centered else F, sum(part.F.points for part in parts), mask)
+        fused[key] = Voxel(
+            np.vstack([F, mean]) if parts[0].F.centered else F,
+            sum(part.F.points for part in parts),
+            mask,
+        )
     return fused
 
 
@@ -64,8 +74,10 @@ def keep_sums(P, W, Y, centered):
 
 def fuse_information(parts, signs, noise):
     """F and w from the sums of some frames, each taken in (1) or out (-1)."""
-    G, r, mean, w = (sum(sign * getattr(part, name) for part, sign in zip(parts, signs, strict=True))
-                     for name in ("G", "r", "mean", "w"))
+    G, r, mean, w = (
+        sum(sign * getattr(part, name) for part, sign in zip(parts, signs, strict=True))
+        for name in ("G", "r", "mean", "w")
+    )
     if r.shape[1] == len(mean):
         return np.linalg.solve(G + noise * np.eye(len(G)), r), w
     F = np.linalg.solve(G + noise * np.eye(len(G)), r[:, :-1] - np.outer(r[:, -1], mean / w))

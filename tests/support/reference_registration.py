@@ -1,4 +1,6 @@
-"""Slow float64 NumPy twins of the registration kernels, written from Park et al. 2017 and for reading only."""
+"""Slow float64 NumPy twins of the registration kernels, written from Park et al. 2017 and for
+reading only.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ def average_inverse_depth(inverse, factor, jump):
     height, width = (n // factor for n in inverse.shape)
     averaged = np.zeros((height, width))
     for v, u in product(range(height), range(width)):
-        block = inverse[v * factor:(v + 1) * factor, u * factor:(u + 1) * factor].astype(float)
+        block = inverse[v * factor : (v + 1) * factor, u * factor : (u + 1) * factor].astype(float)
         near = block[(block > 0) & (block.max() - block <= jump * block.max())]
         if 2 * near.size >= block.size:
             averaged[v, u] = near.mean()
@@ -33,7 +35,11 @@ def average_intensity(intensity):
 
 def average(image, factor):
     height, width = (n // factor for n in image.shape)
-    return image[:height * factor, :width * factor].reshape(height, factor, width, factor).mean(axis=(1, 3))
+    return (
+        image[: height * factor, : width * factor]
+        .reshape(height, factor, width, factor)
+        .mean(axis=(1, 3))
+    )
 
 
 def pack_surfels(inverse, normals, intensity):
@@ -45,7 +51,7 @@ def pack_surfels(inverse, normals, intensity):
     surfels[..., NORMAL], surfels[..., INTENSITY] = normals, image
     smooth = np.array([0.25, 0.5, 0.25])
     for v, u in product(range(1, image.shape[0] - 1), range(1, image.shape[1] - 1)):
-        patch = image[v - 1:v + 2, u - 1:u + 2]
+        patch = image[v - 1 : v + 2, u - 1 : u + 2]
         surfels[v, u, SLOPE_U] = smooth @ (patch[:, 2] - patch[:, 0]) / 2
         surfels[v, u, SLOPE_V] = smooth @ (patch[2] - patch[0]) / 2
     return surfels
@@ -60,8 +66,12 @@ def unprojected(u, v, z, K):
     return np.array([(u - K[2]) / K[0] * z, (v - K[3]) / K[1] * z, z])
 
 
-def sum_normal_equations(source, target, K_source, K_target, T, step, gate, cosine, width, sigma, weight):
-    """H (6, 6), b (6,), and counts: source, in view, inliers, squared distance, coloured, photometric scale."""
+def sum_normal_equations(
+    source, target, K_source, K_target, T, step, gate, cosine, width, sigma, weight
+):
+    """H (6, 6), b (6,), and counts: source, in view, inliers, squared distance, coloured,
+    photometric scale.
+    """
     H, b, counts = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     for v, u in product(range(0, source.shape[0], step), range(0, source.shape[1], step)):
         z = source[v, u, DEPTH]
@@ -89,7 +99,12 @@ def sum_normal_equations(source, target, K_source, K_target, T, step, gate, cosi
         slope = target[i, j, [SLOPE_U, SLOPE_V]]
         if weight > 0 and slope @ slope > LEAST_SLOPE**2:
             e = target[i, j, INTENSITY] + slope @ (x - j, y - i) - source[v, u, INTENSITY]
-            projection = np.array([[K_target[0], 0, -(x - K_target[2])], [0, K_target[1], -(y - K_target[3])]]) / p[2]
+            projection = (
+                np.array(
+                    [[K_target[0], 0, -(x - K_target[2])], [0, K_target[1], -(y - K_target[3])]]
+                )
+                / p[2]
+            )
             g = slope @ projection
             t = (FREEDOM + 1) / (FREEDOM + (e / sigma) ** 2)
             counts[4:] += 1, t * e * e

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from taichi_unifusion.rendering.textured_scene import BACKGROUND, LIGHT, TexturedScene, mip_levels
 from taichi_unifusion.rendering.kernels.texturing import MAX_TAPS, SAMPLES, SHADE, SLACK
+from taichi_unifusion.rendering.textured_scene import BACKGROUND, LIGHT, TexturedScene, mip_levels
 from taichi_unifusion.types import PinholeCamera
 
 STEP = 1e-4  # [px] of the finite differences
@@ -13,25 +13,37 @@ STEP = 1e-4  # [px] of the finite differences
 
 def rays_of(camera: PinholeCamera, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Directions (..., 3) of unit depth through image points."""
-    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(np.shape(u))], axis=-1)
+    return np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(np.shape(u))], axis=-1
+    )
 
 
 def barycentric(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (N,) and barycentric coordinates (N, 3) at which rays (N, 3) meet the plane of a triangle (3, 3), camera frame."""
+    """Depth (N,) and barycentric coordinates (N, 3) at which rays (N, 3) meet the plane of a
+    triangle (3, 3), camera frame.
+    """
     a, b, c = corners
     n = np.cross(b - a, c - a)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (n @ a) / (rays @ n)
     p = rays * z[:, None]
-    return z, np.stack([np.cross(q - p, r - p) @ n for q, r in ((b, c), (c, a), (a, b))], axis=1) / (n @ n)
+    return z, np.stack(
+        [np.cross(q - p, r - p) @ n for q, r in ((b, c), (c, a), (a, b))], axis=1
+    ) / (n @ n)
 
 
 def cast(scene: TexturedScene, camera: PinholeCamera, T_world_camera: np.ndarray):
-    """Depth (0: no hit), triangle (-1) and how near to an edge of any triangle, each (H, W), at the pixels' centres."""
-    v, u = np.mgrid[:camera.height, :camera.width]
+    """Depth (0: no hit), triangle (-1) and how near to an edge of any triangle, each (H, W), at the
+    pixels' centres.
+    """
+    v, u = np.mgrid[: camera.height, : camera.width]
     rays = rays_of(camera, u, v).reshape(-1, 3)
     local = in_camera(scene, T_world_camera)
-    depth, face, margin = np.full(len(rays), np.inf), np.full(len(rays), -1), np.full(len(rays), np.inf)
+    depth, face, margin = (
+        np.full(len(rays), np.inf),
+        np.full(len(rays), -1),
+        np.full(len(rays), np.inf),
+    )
     for f, corners in enumerate(local[scene.faces]):
         z, w = barycentric(corners, rays)
         ahead = np.isfinite(z) & (z > 0)
@@ -47,18 +59,29 @@ def in_camera(scene: TexturedScene, T_world_camera: np.ndarray) -> np.ndarray:
 
 
 def read_surfaces(scene: TexturedScene, camera: PinholeCamera, T_world_camera: np.ndarray):
-    """Depth, cosine of incidence and object at the pixels' centres, and the margin of `cast`, each (H, W)."""
+    """Depth, cosine of incidence and object at the pixels' centres, and the margin of `cast`, each
+    (H, W).
+    """
     depth, face, margin = cast(scene, camera, T_world_camera)
-    v, u = np.mgrid[:camera.height, :camera.width]
+    v, u = np.mgrid[: camera.height, : camera.width]
     rays = rays_of(camera, u, v)
     corners = in_camera(scene, T_world_camera)[scene.faces]
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[face]
-    cosine = np.abs((n * rays).sum(axis=-1)) / np.linalg.norm(n, axis=-1) / np.linalg.norm(rays, axis=-1)
-    return depth, np.where(face < 0, 0, cosine), np.where(face < 0, -1, scene.face_object[face]), margin
+    cosine = (
+        np.abs((n * rays).sum(axis=-1)) / np.linalg.norm(n, axis=-1) / np.linalg.norm(rays, axis=-1)
+    )
+    return (
+        depth,
+        np.where(face < 0, 0, cosine),
+        np.where(face < 0, -1, scene.face_object[face]),
+        margin,
+    )
 
 
 def shade_textured(scene: TexturedScene, camera: PinholeCamera, T_world_camera: np.ndarray):
-    """Colour (H, W, 3) of every pixel, 0..255, and whether (H, W) all its samples are clear of edges."""
+    """Colour (H, W, 3) of every pixel, 0..255, and whether (H, W) all its samples are clear of
+    edges.
+    """
     finer = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
     _, face, margin = cast(scene, finer, T_world_camera)
     sure = blocks(margin > 1e-4).all(axis=-1)
@@ -70,7 +93,11 @@ def shade_textured(scene: TexturedScene, camera: PinholeCamera, T_world_camera: 
         for f, count in zip(*np.unique(seen[y, x], return_counts=True), strict=True):
             i = np.flatnonzero(seen[y, x] == f)
             at = x * SAMPLES + (i % SAMPLES).mean(), y * SAMPLES + (i // SAMPLES).mean()
-            rgb = np.array(BACKGROUND) if f < 0 else shade_triangle(scene, pyramids, finer, local, T_world_camera, f, *at)
+            rgb = (
+                np.array(BACKGROUND)
+                if f < 0
+                else shade_triangle(scene, pyramids, finer, local, T_world_camera, f, *at)
+            )
             image[y, x] += np.clip(rgb, 0, 1) * count / SAMPLES**2
     return 255 * image, sure
 
@@ -78,7 +105,9 @@ def shade_textured(scene: TexturedScene, camera: PinholeCamera, T_world_camera: 
 def blocks(samples: np.ndarray) -> np.ndarray:
     """(s H, s W) as (H, W, s^2)."""
     height, width = (size // SAMPLES for size in samples.shape)
-    return samples.reshape(height, SAMPLES, width, SAMPLES).swapaxes(1, 2).reshape(height, width, -1)
+    return (
+        samples.reshape(height, SAMPLES, width, SAMPLES).swapaxes(1, 2).reshape(height, width, -1)
+    )
 
 
 def shade_triangle(scene, pyramids, camera, local, T_world_camera, f, u, v):
@@ -86,7 +115,9 @@ def shade_triangle(scene, pyramids, camera, local, T_world_camera, f, u, v):
     corners = local[scene.faces[f]]
 
     def weights_at(u, v):
-        return np.clip(barycentric(corners, rays_of(camera, np.array([u]), np.array([v])))[1][0], 0, None)
+        return np.clip(
+            barycentric(corners, rays_of(camera, np.array([u]), np.array([v])))[1][0], 0, None
+        )
 
     w = weights_at(u, v)
     w /= w.sum()
@@ -130,5 +161,8 @@ def bilinear(level: np.ndarray, st: np.ndarray) -> np.ndarray:
     x, y = (st - np.floor(st)) * (width, height) - 0.5
     x0, y0 = int(np.floor(x)), int(np.floor(y))
     fx, fy = x - x0, y - y0
-    return sum(wy * wx * level[(y0 + i) % height, (x0 + j) % width]
-               for i, wy in ((0, 1 - fy), (1, fy)) for j, wx in ((0, 1 - fx), (1, fx)))
+    return sum(
+        wy * wx * level[(y0 + i) % height, (x0 + j) % width]
+        for i, wy in ((0, 1 - fy), (1, fy))
+        for j, wx in ((0, 1 - fx), (1, fx))
+    )

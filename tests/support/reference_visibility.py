@@ -1,4 +1,5 @@
-"""Slow float64 twins of the votes of frames: evidence for the surface in every cell, and against it.
+"""Slow float64 twins of the votes of frames: evidence for the surface in every cell, and against
+it.
 
 A map is a dict from voxel index to `reference.Voxel`, evidence one from voxel index to (64,) votes.
 """
@@ -10,39 +11,50 @@ from itertools import product
 import numpy as np
 from reference import CELLS, CORNERS, cell_number
 
-CENTERS = (np.array(list(product(range(CELLS), repeat=3))) + 0.5) / CELLS  # (64, 3) of cells, voxels from the voxel's corner
+# (64, 3) of cells, voxels from the voxel's corner
+CENTERS = (np.array(list(product(range(CELLS), repeat=3))) + 0.5) / CELLS
 
 
 def read_behind(p, depth, camera):
     """How far behind p [m, camera] the reading of its pixel lies, None where there is no reading."""
     if p[2] <= 0:
         return None
-    u, v = (int(np.floor(x + 0.5)) for x in (camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy))
+    u, v = (
+        int(np.floor(x + 0.5))
+        for x in (camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy)
+    )
     if not (0 <= u < camera.width and 0 <= v < camera.height) or depth[v, u] <= 0:
         return None
     return float(depth[v, u]) - p[2]
 
 
 def seen_beside(p, slack, depth, camera):
-    """Whether any of the 3x3 pixels around that of p reads its depth; never on the border of the image."""
-    u, v = (int(np.floor(x + 0.5)) for x in (camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy))
+    """Whether any of the 3x3 pixels around that of p reads its depth; never on the border of the
+    image.
+    """
+    u, v = (
+        int(np.floor(x + 0.5))
+        for x in (camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy)
+    )
     if not (1 <= u < camera.width - 1 and 1 <= v < camera.height - 1):
         return False
-    readings = depth[v - 1:v + 2, u - 1:u + 2]
+    readings = depth[v - 1 : v + 2, u - 1 : u + 2]
     return bool(((readings > 0) & (np.abs(readings - p[2]) < slack)).any())
 
 
 def vote_of_free_cell(p, voxel_size, depth, camera):
     """-1 where a ray passes a cell in which nothing was seen."""
     behind = read_behind(p, depth, camera)
-    return -1 if behind is not None and behind > 0.5 * voxel_size + 0.003 * p[2]**2 else 0
+    return -1 if behind is not None and behind > 0.5 * voxel_size + 0.003 * p[2] ** 2 else 0
 
 
 def vote_of_surface(p, normal, voxel_size, depth, camera):
-    """1 where the reading lies on a point of the surface [m, camera], -1 where it lies behind, and not at a grazing angle."""
+    """1 where the reading lies on a point of the surface [m, camera], -1 where it lies behind, and
+    not at a grazing angle.
+    """
     behind = read_behind(p, depth, camera)
     cosine = max(abs(normal @ p) / np.linalg.norm(p), 0.02)
-    slack = 0.5 * voxel_size + 0.003 * p[2]**2 + p[2] / camera.fx * np.tan(np.arccos(cosine))
+    slack = 0.5 * voxel_size + 0.003 * p[2] ** 2 + p[2] / camera.fx * np.tan(np.arccos(cosine))
     if behind is None:
         return int(p[2] > 0 and seen_beside(p, slack, depth, camera))
     if behind > slack:
@@ -84,7 +96,9 @@ def add_evidence(evidence, more):
 
 
 def interpolate_evidence(evidence, masks, x):
-    """(N,) tent-weighted mean over the eight nearest cells that have support or were seen through, 1 where none is; x [voxels]."""
+    """(N,) tent-weighted mean over the eight nearest cells that have support or were seen through,
+    1 where none is; x [voxels].
+    """
     values = np.zeros(len(x))
     for n, point in enumerate(x * CELLS - 0.5):
         corner, total, weight = np.floor(point).astype(int), 0.0, 0.0

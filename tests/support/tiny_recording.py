@@ -1,4 +1,6 @@
-"""A few small frames of the synthetic room, in memory and as a `folder` recording, with settings that fit them."""
+"""A few small frames of the synthetic room, in memory and as a `folder` recording, with settings
+that fit them.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +21,21 @@ DEVICE = os.environ.get("UNIFUSION_DEVICE", "cpu")
 WIDTH, HEIGHT, DEPTH_SCALE = 160, 120, 1000.0
 
 # A pixel spans 1.4 cm at 2 m: voxels as large as that asks for.
-CONFIG = Config(device=DEVICE, surface=SurfaceSettings(voxel_size=0.1, support_points=1),
-                color=PropertySettings(voxel_size=0.05))
-FLAGS = ["--device", DEVICE, "--surface.voxel-size", "0.1", "--surface.support-points", "1", "--color.voxel-size", "0.05"]
+CONFIG = Config(
+    device=DEVICE,
+    surface=SurfaceSettings(voxel_size=0.1, support_points=1),
+    color=PropertySettings(voxel_size=0.05),
+)
+FLAGS = [
+    "--device",
+    DEVICE,
+    "--surface.voxel-size",
+    "0.1",
+    "--surface.support-points",
+    "1",
+    "--color.voxel-size",
+    "0.05",
+]
 
 
 def make_frames(count: int) -> list[Frame]:
@@ -34,11 +48,23 @@ def write_folder(folder: Path, frames: Sequence[Frame]) -> Path:
     for name in ("depth", "color", "poses"):
         (folder / name).mkdir(parents=True)
     camera = frames[0].camera
-    (folder / "camera.yaml").write_text(yaml.safe_dump({
-        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
-        "depth_scale": DEPTH_SCALE}))
+    (folder / "camera.yaml").write_text(
+        yaml.safe_dump(
+            {
+                "width": camera.width,
+                "height": camera.height,
+                "fx": camera.fx,
+                "fy": camera.fy,
+                "cx": camera.cx,
+                "cy": camera.cy,
+                "depth_scale": DEPTH_SCALE,
+            }
+        )
+    )
     for i, frame in enumerate(frames):
-        assert cv2.imwrite(str(folder / "depth" / f"{i}.png"), np.rint(frame.depth * DEPTH_SCALE).astype(np.uint16))
+        assert cv2.imwrite(
+            str(folder / "depth" / f"{i}.png"), np.rint(frame.depth * DEPTH_SCALE).astype(np.uint16)
+        )
         assert cv2.imwrite(str(folder / "color" / f"{i}.png"), frame.color[..., ::-1])
         np.savetxt(folder / "poses" / f"{i}.txt", frame.T_world_camera)
     return folder

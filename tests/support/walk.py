@@ -8,8 +8,8 @@ import numpy as np
 
 from taichi_unifusion.datasets import Dataset
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
-from taichi_unifusion.tracking import TrackingResult
 from taichi_unifusion.geometry import se3
+from taichi_unifusion.tracking import TrackingResult
 from taichi_unifusion.types import Frame
 
 
@@ -46,9 +46,15 @@ def black(frame):
 
 def errors(result: TrackingResult, frames) -> np.ndarray:
     """Distances [m] from the true positions, both seen from the first tracked frame."""
-    pairs = [(f.T_world_camera, frames[f.index].T_world_camera) for f in result.frames if f.T_world_camera is not None]
+    pairs = [
+        (f.T_world_camera, frames[f.index].T_world_camera)
+        for f in result.frames
+        if f.T_world_camera is not None
+    ]
     ours, truth = (np.array(poses) for poses in zip(*pairs, strict=True))
-    return np.linalg.norm((se3.inverse(ours[0]) @ ours - se3.inverse(truth[0]) @ truth)[:, :3, 3], axis=1)
+    return np.linalg.norm(
+        (se3.inverse(ours[0]) @ ours - se3.inverse(truth[0]) @ truth)[:, :3, 3], axis=1
+    )
 
 
 def verdicts(result: TrackingResult) -> list[str]:

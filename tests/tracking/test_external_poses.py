@@ -9,10 +9,10 @@ import pytest
 from walk import Listed, bare, first_frames, verdicts
 
 from taichi_unifusion.errors import DatasetError, InputError
-from taichi_unifusion.geometry.quaternions import rotation_to_quaternion
 from taichi_unifusion.files.trajectories import write_trajectory
-from taichi_unifusion.tracking import TrackedFrame, Verdict, make_tracker
 from taichi_unifusion.geometry import se3
+from taichi_unifusion.geometry.quaternions import rotation_to_quaternion
+from taichi_unifusion.tracking import TrackedFrame, Verdict, make_tracker
 from taichi_unifusion.tracking.external import gaps, interpolate
 from taichi_unifusion.tracking.rgbd import RgbdTracker
 from taichi_unifusion.tracking.sequence import track_sequence
@@ -27,7 +27,16 @@ def walk():
 
 
 def tum_line(stamp, T):
-    return " ".join(map(repr, [float(stamp), *map(float, T[:3, 3]), *map(float, rotation_to_quaternion(T[None, :3, :3])[0])]))
+    return " ".join(
+        map(
+            repr,
+            [
+                float(stamp),
+                *map(float, T[:3, 3]),
+                *map(float, rotation_to_quaternion(T[None, :3, :3])[0]),
+            ],
+        )
+    )
 
 
 @pytest.mark.parametrize("kind", ["tum", "kitti", "replica", "scannet", "7scenes"])
@@ -35,15 +44,21 @@ def test_trajectories_of_other_programs(kind, walk, tmp_path):
     poses = [frame.T_world_camera for frame in walk]
     path = tmp_path / "poses"
     if kind == "tum":
-        lines = [tum_line(frame.timestamp + 0.004, frame.T_world_camera) for frame in reversed(walk)]
+        lines = [
+            tum_line(frame.timestamp + 0.004, frame.T_world_camera) for frame in reversed(walk)
+        ]
         path.write_text("\r\n".join(["# a comment", *lines]))
     elif kind in ("kitti", "replica"):
-        np.savetxt(path, [pose[:3 if kind == "kitti" else 4].ravel() for pose in poses])
+        np.savetxt(path, [pose[: 3 if kind == "kitti" else 4].ravel() for pose in poses])
     else:
         path.mkdir()
         for i, pose in enumerate(poses):
-            np.savetxt(path / (f"{i}.txt" if kind == "scannet" else f"frame-{i:06d}.pose.txt"), pose)
-    result = track_sequence(Listed([bare(frame) for frame in walk]), make_tracker("external", trajectory=path))
+            np.savetxt(
+                path / (f"{i}.txt" if kind == "scannet" else f"frame-{i:06d}.pose.txt"), pose
+            )
+    result = track_sequence(
+        Listed([bare(frame) for frame in walk]), make_tracker("external", trajectory=path)
+    )
     assert verdicts(result) == ["given"] * len(walk)
     np.testing.assert_allclose([f.T_world_camera for f in result.frames], poses, atol=1e-6)
 
@@ -53,55 +68,92 @@ def test_poses_of_a_folder_belong_to_the_numbers_in_names(name, walk, tmp_path):
     """A cut of a recording, or every fifth of its files: places in it are not the numbers."""
     for i, frame in enumerate(walk):
         np.savetxt(tmp_path / f"frame-{100 + i:06d}.pose.txt", frame.T_world_camera)
-    kept = [replace(bare(frame), name="somewhere/" + name.format(100 + i)) for i, frame in enumerate(walk)][3::4]
+    kept = [
+        replace(bare(frame), name="somewhere/" + name.format(100 + i))
+        for i, frame in enumerate(walk)
+    ][3::4]
     result = track_sequence(Listed(kept), make_tracker("external", trajectory=tmp_path))
-    np.testing.assert_allclose([f.T_world_camera for f in result.frames], [f.T_world_camera for f in walk[3::4]], atol=1e-6)
+    np.testing.assert_allclose(
+        [f.T_world_camera for f in result.frames], [f.T_world_camera for f in walk[3::4]], atol=1e-6
+    )
 
 
 def test_our_own_trajectory_file_reads_back_without_time_stamps(walk, tmp_path):
     frames = [replace(frame, timestamp=None) for frame in walk[:6]]
     result = track_sequence(Listed(frames), RgbdTracker())
     write_trajectory(tmp_path / "trajectory.txt", result.trajectory)
-    again = track_sequence(Listed(frames)[1::2], make_tracker("external", trajectory=tmp_path / "trajectory.txt"))
+    again = track_sequence(
+        Listed(frames)[1::2], make_tracker("external", trajectory=tmp_path / "trajectory.txt")
+    )
     assert [frame.index for frame in again.frames] == [1, 3, 5] and verdicts(again) == ["given"] * 3
-    np.testing.assert_allclose(again.frames[1].T_world_camera, result.frames[3].T_world_camera, atol=1e-7)
+    np.testing.assert_allclose(
+        again.frames[1].T_world_camera, result.frames[3].T_world_camera, atol=1e-7
+    )
 
 
 def test_S3_gaps_are_named_and_filled_only_when_asked(walk, tmp_path, caplog):
     path = tmp_path / "poses.txt"
-    path.write_text("\n".join(tum_line(frame.timestamp, frame.T_world_camera) for frame in [*walk[:4], *walk[7:11]]))
+    path.write_text(
+        "\n".join(
+            tum_line(frame.timestamp, frame.T_world_camera) for frame in [*walk[:4], *walk[7:11]]
+        )
+    )
     plain = track_sequence(Listed(walk), make_tracker("external", trajectory=path))
     assert plain.details["gaps"] == ["4-6", "11"] and "3" not in plain.details["gaps"]
-    assert any("4 of 12 frames are not mapped (no pose): 4-6, 11" in record.message for record in caplog.records)
-    filled = track_sequence(Listed(walk), make_tracker("external", trajectory=path, interpolate=True))
+    assert any(
+        "4 of 12 frames are not mapped (no pose): 4-6, 11" in record.message
+        for record in caplog.records
+    )
+    filled = track_sequence(
+        Listed(walk), make_tracker("external", trajectory=path, interpolate=True)
+    )
     assert verdicts(filled)[4:7] == ["interpolated"] * 3 and filled.details["gaps"] == ["11"]
-    moved = [se3.distance(filled.frames[i].T_world_camera, walk[i].T_world_camera)[0] for i in (4, 5, 6)]
+    moved = [
+        se3.distance(filled.frames[i].T_world_camera, walk[i].T_world_camera)[0] for i in (4, 5, 6)
+    ]
     assert max(moved) < 0.01
 
 
 def test_long_gaps_are_never_filled(walk, tmp_path):
     path = tmp_path / "poses.txt"
-    late = [replace(frame, timestamp=frame.timestamp + 10 * (i > 5)) for i, frame in enumerate(walk)]
-    path.write_text("\n".join(tum_line(frame.timestamp, frame.T_world_camera) for frame in late[::3]))
-    result = track_sequence(Listed([*late[:5], replace(late[5], timestamp=5.0)]),
-                            make_tracker("external", trajectory=path, interpolate=True))
+    late = [
+        replace(frame, timestamp=frame.timestamp + 10 * (i > 5)) for i, frame in enumerate(walk)
+    ]
+    path.write_text(
+        "\n".join(tum_line(frame.timestamp, frame.T_world_camera) for frame in late[::3])
+    )
+    result = track_sequence(
+        Listed([*late[:5], replace(late[5], timestamp=5.0)]),
+        make_tracker("external", trajectory=path, interpolate=True),
+    )
     assert result.frames[5].verdict is Verdict.MISSING and "away" in result.frames[5].message
 
 
 def test_interpolation_is_constant_motion():
-    T_a, T_b = se3.exp(np.array([0, 0, 0, 0, 0, 0.2])), se3.exp(np.array([1.0, 0.5, 0, 0.1, 0, 0.6]))
+    T_a, T_b = (
+        se3.exp(np.array([0, 0, 0, 0, 0, 0.2])),
+        se3.exp(np.array([1.0, 0.5, 0, 0.1, 0, 0.6])),
+    )
     np.testing.assert_allclose(interpolate(T_a, T_b, 0), T_a, atol=CONSISTENT)
     np.testing.assert_allclose(interpolate(T_a, T_b, 1), T_b, atol=CONSISTENT)
     half = interpolate(T_a, T_b, 0.5)
     np.testing.assert_allclose(half @ se3.inverse(T_a) @ half, T_b, atol=1e-8)
 
 
-@pytest.mark.parametrize(("content", "told"), [
-    ("", "holds no poses"), ("# nothing\n", "holds no poses"), ("1 2 3\n", "a row has 3 numbers"),
-    ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", "line 2"), ("x 0 0 0 0 0 0 1\n", "'x' is not a time stamp"),
-    ("0 0 0 0 0 0 0 2\n", "quaternion's length is 2"), ("0 0 0 nan 0 0 0 1\n", "no usable pose"),
-    (" ".join(["1"] * 12) + "\n1 0\n", "expected 12 numbers"), (" ".join(["1"] * 16), "no usable pose"),
-])
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("", "holds no poses"),
+        ("# nothing\n", "holds no poses"),
+        ("1 2 3\n", "a row has 3 numbers"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", "line 2"),
+        ("x 0 0 0 0 0 0 1\n", "'x' is not a time stamp"),
+        ("0 0 0 0 0 0 0 2\n", "quaternion's length is 2"),
+        ("0 0 0 nan 0 0 0 1\n", "no usable pose"),
+        (" ".join(["1"] * 12) + "\n1 0\n", "expected 12 numbers"),
+        (" ".join(["1"] * 16), "no usable pose"),
+    ],
+)
 def test_P7_bad_trajectories_are_one_clear_error(content, told, tmp_path):
     path = tmp_path / "poses.txt"
     path.write_text(content)
@@ -118,11 +170,16 @@ def test_a_trajectory_of_another_recording_is_an_error_with_both_ranges(walk, tm
     assert "1e+06" in str(caught.value)
 
 
-@pytest.mark.parametrize(("mode", "options", "told"), [
-    ("slam", {}, "choose one of given, external, internal, rgbd"), ("external", {}, "--trajectory"),
-    ("rgbd", {"trajectory": "x"}, "reads no trajectory"), ("given", {"interpolate": True}, "reads no trajectory"),
-    ("external", {"trajectory": "nowhere"}, "no such file"),
-])
+@pytest.mark.parametrize(
+    ("mode", "options", "told"),
+    [
+        ("slam", {}, "choose one of given, external, internal, rgbd"),
+        ("external", {}, "--trajectory"),
+        ("rgbd", {"trajectory": "x"}, "reads no trajectory"),
+        ("given", {"interpolate": True}, "reads no trajectory"),
+        ("external", {"trajectory": "nowhere"}, "no such file"),
+    ],
+)
 def test_tracker_options_that_make_no_sense(mode, options, told):
     with pytest.raises((InputError, DatasetError), match=told):
         make_tracker(mode, **options)
@@ -130,4 +187,8 @@ def test_tracker_options_that_make_no_sense(mode, options, told):
 
 def test_gaps_are_runs():
     poses = [None, np.eye(4), None, None, np.eye(4), None]
-    assert gaps([TrackedFrame(i, Verdict.GIVEN, pose) for i, pose in enumerate(poses)]) == ["0", "2-3", "5"]
+    assert gaps([TrackedFrame(i, Verdict.GIVEN, pose) for i, pose in enumerate(poses)]) == [
+        "0",
+        "2-3",
+        "5",
+    ]

@@ -9,7 +9,7 @@ from taichi_unifusion.geometry import se3
 from taichi_unifusion.tracking.pose_graph import FLOOR, Edge, Prior, optimize, with_floor
 
 EXACT = 1e-9
-CONVERGED = 1e-5   # [m, rad] of an optimum that Gauss-Newton walks to
+CONVERGED = 1e-5  # [m, rad] of an optimum that Gauss-Newton walks to
 INFORMATION = np.diag(np.array([0.01] * 3 + [0.005] * 3) ** -2)
 
 
@@ -21,18 +21,32 @@ def twists(seed: int, count: int = 20, turn: float = 1.0) -> np.ndarray:
 def circle(count: int) -> np.ndarray:
     """Poses along a circle of 2 m, looking along it."""
     angles = 2 * np.pi * np.arange(count) / count
-    return np.array([se3.exp(np.array([0, 0, 0, 0, 0, a])) @ se3.exp(np.array([2.0, 0, 0, 0, 0, 0])) for a in angles])
+    return np.array(
+        [
+            se3.exp(np.array([0, 0, 0, 0, 0, a])) @ se3.exp(np.array([2.0, 0, 0, 0, 0, 0]))
+            for a in angles
+        ]
+    )
 
 
 def chain(truth: np.ndarray, noise: np.ndarray, closed: bool = True) -> list[Edge]:
     """Measured motions from each pose to the next, the last of them back to the first."""
-    return [Edge(a, (a + 1) % len(truth), se3.inverse(truth[a]) @ truth[(a + 1) % len(truth)] @ se3.exp(noise[a]), INFORMATION,
-                 robust=a + 1 == len(truth), loop=a + 1 == len(truth)) for a in range(len(truth) - (not closed))]
+    return [
+        Edge(
+            a,
+            (a + 1) % len(truth),
+            se3.inverse(truth[a]) @ truth[(a + 1) % len(truth)] @ se3.exp(noise[a]),
+            INFORMATION,
+            robust=a + 1 == len(truth),
+            loop=a + 1 == len(truth),
+        )
+        for a in range(len(truth) - (not closed))
+    ]
 
 
 def integrated(edges: list[Edge], count: int) -> np.ndarray:
     poses = [np.eye(4)]
-    for edge in edges[:count - 1]:
+    for edge in edges[: count - 1]:
         poses.append(poses[-1] @ edge.T_a_b)
     return np.array(poses)
 
@@ -90,13 +104,16 @@ def test_exact_measurements_are_met_exactly():
 
 def test_a_loop_takes_back_drift():
     truth = circle(40)
-    noise = 0.3 * twists(5, 40) * np.array([0.01] * 3 + [0.005] * 3) + [0.003, 0, 0, 0, 0, 0.002]  # a bias too
+    # a bias too
+    noise = 0.3 * twists(5, 40) * np.array([0.01] * 3 + [0.005] * 3) + [0.003, 0, 0, 0, 0, 0.002]
     noise[-1] = 0
     edges = chain(truth, noise)
     drifted = integrated(edges, 40)
     found = optimize(drifted, edges)
     assert errors(drifted, truth).max() > 0.15
-    assert np.sqrt((errors(found.T_world_node, truth) ** 2).mean()) < 0.5 * np.sqrt((errors(drifted, truth) ** 2).mean())
+    assert np.sqrt((errors(found.T_world_node, truth) ** 2).mean()) < 0.5 * np.sqrt(
+        (errors(drifted, truth) ** 2).mean()
+    )
     assert found.weights[-1] > 0.5
 
 
@@ -104,7 +121,10 @@ def test_a_false_loop_is_not_believed():
     truth = circle(40)
     edges = chain(truth, 0.2 * twists(6, 40) * np.array([0.01] * 3 + [0.005] * 3))
     before = optimize(integrated(edges, 40), edges).T_world_node
-    lie = Edge(3, 25, se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1])), INFORMATION, robust=True, loop=True)  # 4 m off
+    # 4 m off
+    lie = Edge(
+        3, 25, se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1])), INFORMATION, robust=True, loop=True
+    )
     found = optimize(integrated(edges, 40), [*edges, lie])
     assert found.weights[-1] < 0.01
     assert errors(found.T_world_node, before).max() < 0.01
@@ -114,7 +134,9 @@ def test_priors_hold_the_poses():
     truth = circle(10)
     edges = chain(truth, np.full((10, 6), 0.01), closed=False)
     strong = [Prior(i, pose, 1e8 * np.eye(6)) for i, pose in enumerate(truth)]
-    np.testing.assert_allclose(optimize(integrated(edges, 10), edges, strong).T_world_node, truth, atol=1e-4)
+    np.testing.assert_allclose(
+        optimize(integrated(edges, 10), edges, strong).T_world_node, truth, atol=1e-4
+    )
 
 
 def test_where_the_world_is_does_not_matter():
@@ -134,18 +156,29 @@ def test_open3d_finds_the_same_optimum():
     o3d = pytest.importorskip("open3d", reason="open3d is not installed")
     graphs, count = o3d.pipelines.registration, 20
     truth = circle(count)
-    edges = [Edge(e.a, e.b, e.T_a_b, e.information) for e in chain(truth, 0.5 * twists(8, count) * 0.01)]
+    edges = [
+        Edge(e.a, e.b, e.T_a_b, e.information) for e in chain(truth, 0.5 * twists(8, count) * 0.01)
+    ]
     start = integrated(edges, count)
     graph = graphs.PoseGraph()
     for pose in start:
         graph.nodes.append(graphs.PoseGraphNode(pose))
     swap = np.r_[3:6, 0:3]  # theirs: rotation first
     for edge in edges:
-        graph.edges.append(graphs.PoseGraphEdge(edge.b, edge.a, edge.T_a_b, edge.information[np.ix_(swap, swap)], False))
+        graph.edges.append(
+            graphs.PoseGraphEdge(
+                edge.b, edge.a, edge.T_a_b, edge.information[np.ix_(swap, swap)], False
+            )
+        )
     option = graphs.GlobalOptimizationOption(reference_node=0)
-    graphs.global_optimization(graph, graphs.GlobalOptimizationLevenbergMarquardt(),
-                               graphs.GlobalOptimizationConvergenceCriteria(), option)
+    graphs.global_optimization(
+        graph,
+        graphs.GlobalOptimizationLevenbergMarquardt(),
+        graphs.GlobalOptimizationConvergenceCriteria(),
+        option,
+    )
     theirs = np.array([node.pose for node in graph.nodes])
     ours = optimize(start, edges).T_world_node
     assert errors(start, ours).max() > 0.02
-    assert errors(ours, theirs).max() < 2e-3  # theirs linearises a residual of other form: equal to first order
+    # theirs linearises a residual of other form: equal to first order
+    assert errors(ours, theirs).max() < 2e-3

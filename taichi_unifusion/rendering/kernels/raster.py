@@ -1,8 +1,9 @@
 """Software rasteriser: a coloured mesh as a picture, with no graphics library and no screen.
 
-A triangle is set up in homogeneous image coordinates p = (u w, v w, w) (Olano and Greer 1997), so none has to be clipped: the
-pixel ray q = (u, v, 1) meets it where q . (p1 x p2), q . (p2 x p0), q . (p0 x p1) all have the sign of det(p0, p1, p2).
-The depth buffer holds depth and triangle in one integer, so that the result does not depend on the order of threads.
+A triangle is set up in homogeneous image coordinates p = (u w, v w, w) (Olano and Greer 1997), so
+none has to be clipped: the pixel ray q = (u, v, 1) meets it where q . (p1 x p2), q . (p2 x p0), q .
+(p0 x p1) all have the sign of det(p0, p1, p2). The depth buffer holds depth and triangle in one
+integer, so that the result does not depend on the order of threads.
 """
 
 import taichi as ti
@@ -10,17 +11,20 @@ import taichi as ti
 from ...kernels.voxels import Floats2, Ints2, row3
 
 EMPTY = (1 << 63) - 1  # depth buffer value where no triangle is seen
-EDGE = 1e-7            # barycentric slack: pixels on a shared edge belong to both triangles, never to none
+EDGE = 1e-7  # barycentric slack: pixels on a shared edge belong to both triangles, never to none
 GOLDEN_ANGLE = 2.3999632
 
-# The look: half Lambert under one light and ambient occlusion, both kept mild so that colours stay true
-LIFT = 1.15            # brings a surface that half faces the light back to its own colour
+# The look: half Lambert under one light and ambient occlusion, both kept mild so that colours stay
+# true
+LIFT = 1.15  # brings a surface that half faces the light back to its own colour
 OCCLUSION_GAIN = 2.0
 OCCLUSION_BIAS = 0.15  # sine of the slope that noise on flat surfaces may have
 OCCLUSION_SHARE = 0.5  # how dark the deepest corner gets
 
-Projection = ti.types.ndarray(dtype=ti.f64, ndim=2)   # (3, 4) world [m] -> homogeneous image (u w, v w, w), w is depth [m]
-DepthBuffer = ti.types.ndarray(dtype=ti.i64, ndim=2)  # (H, W) bits of the depth << 32 | triangle, or EMPTY
+# (3, 4) world [m] -> homogeneous image (u w, v w, w), w is depth [m]
+Projection = ti.types.ndarray(dtype=ti.f64, ndim=2)
+# (H, W) bits of the depth << 32 | triangle, or EMPTY
+DepthBuffer = ti.types.ndarray(dtype=ti.i64, ndim=2)
 
 
 @ti.func
@@ -28,21 +32,37 @@ def project(projection: ti.template(), x: ti.template()):
     """Homogeneous image coordinates of world point x, in float64."""
     p = ti.Vector([0.0, 0.0, 0.0], ti.f64)
     for r in ti.static(range(3)):
-        p[r] = projection[r, 0] * x[0] + projection[r, 1] * x[1] + projection[r, 2] * x[2] + projection[r, 3]
+        p[r] = (
+            projection[r, 0] * x[0]
+            + projection[r, 1] * x[1]
+            + projection[r, 2] * x[2]
+            + projection[r, 3]
+        )
     return p
 
 
 @ti.func
 def edge_functions(p0: ti.template(), p1: ti.template(), p2: ti.template(), two_sided: ti.i32):
-    """Rows E with E (u, v, 1) = barycentric coordinates / depth; all 0 edge-on and, unless two_sided, seen from behind."""
+    """Rows E with E (u, v, 1) = barycentric coordinates / depth; all 0 edge-on and, unless
+    two_sided, seen from behind.
+    """
     det = p0.dot(p1.cross(p2))  # negative where the counter-clockwise side faces the camera
     scale = 1.0 / det if det < 0.0 or (two_sided == 1 and det > 0.0) else ti.cast(0.0, ti.f64)
     return ti.Matrix.rows([p1.cross(p2) * scale, p2.cross(p0) * scale, p0.cross(p1) * scale])
 
 
 @ti.func
-def image_box(p0: ti.template(), p1: ti.template(), p2: ti.template(), near: ti.f64, width: ti.i32, height: ti.i32):
-    """First and last column and row of the pixels that the part of a triangle beyond the near plane may touch."""
+def image_box(
+    p0: ti.template(),
+    p1: ti.template(),
+    p2: ti.template(),
+    near: ti.f64,
+    width: ti.i32,
+    height: ti.i32,
+):
+    """First and last column and row of the pixels that the part of a triangle beyond the near plane
+    may touch.
+    """
     corners = ti.Matrix.rows([p0, p1, p2])
     low, high = ti.Vector([1e9, 1e9], ti.f64), ti.Vector([-1e9, -1e9], ti.f64)
     for k in ti.static(range(3)):
@@ -62,13 +82,13 @@ def image_box(p0: ti.template(), p1: ti.template(), p2: ti.template(), near: ti.
 @ti.kernel
 def rasterize(
     # in:
-    vertices: Floats2,       # (V, 3) world [m]
-    faces: Ints2,            # (F, 3), counter-clockwise seen from the side that is drawn
-    two_sided: ti.i32,       # 1: both sides are drawn
+    vertices: Floats2,  # (V, 3) world [m]
+    faces: Ints2,  # (F, 3), counter-clockwise seen from the side that is drawn
+    two_sided: ti.i32,  # 1: both sides are drawn
     projection: Projection,
-    near: ti.f64,            # [m]
+    near: ti.f64,  # [m]
     # out:
-    nearest: DepthBuffer,    # (H, W)
+    nearest: DepthBuffer,  # (H, W)
 ):
     """The nearest triangle that shows a drawn side at the centre of every pixel."""
     for v, u in nearest:
@@ -82,11 +102,20 @@ def rasterize(
             box = image_box(p0, p1, p2, near, nearest.shape[1], nearest.shape[0])
             for v in range(box[2], box[3] + 1):
                 for u in range(box[0], box[1] + 1):
-                    b = E @ ti.Vector([ti.cast(u, ti.f64), ti.cast(v, ti.f64), ti.cast(1.0, ti.f64)])
+                    b = E @ ti.Vector(
+                        [ti.cast(u, ti.f64), ti.cast(v, ti.f64), ti.cast(1.0, ti.f64)]
+                    )
                     inverse_depth = b.sum()
-                    if b.min() >= -EDGE * inverse_depth and inverse_depth > 0.0 and inverse_depth * near <= 1.0:
-                        bits = ti.bit_cast(ti.cast(1.0 / inverse_depth, ti.f32), ti.i32)  # positive floats sort like integers
-                        ti.atomic_min(nearest[v, u], (ti.cast(bits, ti.i64) << 32) | ti.cast(f, ti.i64))
+                    if (
+                        b.min() >= -EDGE * inverse_depth
+                        and inverse_depth > 0.0
+                        and inverse_depth * near <= 1.0
+                    ):
+                        # positive floats sort like integers
+                        bits = ti.bit_cast(ti.cast(1.0 / inverse_depth, ti.f32), ti.i32)
+                        ti.atomic_min(
+                            nearest[v, u], (ti.cast(bits, ti.i64) << 32) | ti.cast(f, ti.i64)
+                        )
 
 
 @ti.func
@@ -96,43 +125,66 @@ def depth_of(value: ti.i64) -> ti.f32:
 
 
 @ti.func
-def occlusion(nearest: ti.template(), v: ti.i32, u: ti.i32, n: ti.math.vec3, intrinsics: ti.math.vec4,
-              radius: ti.f32, taps: ti.i32) -> ti.f32:
-    """How much of the sky over a pixel's surface its surroundings within `radius` [m] hide, 0..1 (n in the camera frame)."""
+def occlusion(
+    nearest: ti.template(),
+    v: ti.i32,
+    u: ti.i32,
+    n: ti.math.vec3,
+    intrinsics: ti.math.vec4,
+    radius: ti.f32,
+    taps: ti.i32,
+) -> ti.f32:
+    """How much of the sky over a pixel's surface its surroundings within `radius` [m] hide, 0..1 (n
+    in the camera frame).
+    """
     z = depth_of(nearest[v, u])
-    at = z * ti.math.vec3((u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0)
+    at = z * ti.math.vec3(
+        (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
+    )
     reach = ti.min(radius * intrinsics[0] / z, 0.25 * nearest.shape[1])  # [px]
-    turn = 6.2831853 * ti.math.fract(52.9829189 * ti.math.fract(0.06711056 * u + 0.00583715 * v))  # spreads the error evenly
+    # spreads the error evenly
+    turn = 6.2831853 * ti.math.fract(52.9829189 * ti.math.fract(0.06711056 * u + 0.00583715 * v))
     hidden = 0.0
     for k in range(taps):
         r, angle = reach * (k + 0.5) / taps, turn + k * GOLDEN_ANGLE
         y = ti.math.clamp(ti.round(v + r * ti.sin(angle), ti.i32), 0, nearest.shape[0] - 1)
         x = ti.math.clamp(ti.round(u + r * ti.cos(angle), ti.i32), 0, nearest.shape[1] - 1)
         if nearest[y, x] != ti.i64(EMPTY):
-            d = depth_of(nearest[y, x]) * ti.math.vec3((x - intrinsics[2]) / intrinsics[0],
-                                                       (y - intrinsics[3]) / intrinsics[1], 1.0) - at
+            d = (
+                depth_of(nearest[y, x])
+                * ti.math.vec3(
+                    (x - intrinsics[2]) / intrinsics[0], (y - intrinsics[3]) / intrinsics[1], 1.0
+                )
+                - at
+            )
             length = d.norm() + 1e-6
-            hidden += ti.max(0.0, n.dot(d) / length - OCCLUSION_BIAS) * ti.max(0.0, 1.0 - length / radius)
+            hidden += ti.max(0.0, n.dot(d) / length - OCCLUSION_BIAS) * ti.max(
+                0.0, 1.0 - length / radius
+            )
     return ti.min(1.0, OCCLUSION_GAIN * hidden / taps)
 
 
 @ti.kernel
 def shade_pixels(
     # in:
-    vertices: Floats2, normals: Floats2, colors: Floats2,  # (V, 3) world [m], unit, RGB in [0, 1]
-    faces: Ints2,                                          # (F, 3)
+    vertices: Floats2,
+    normals: Floats2,
+    colors: Floats2,  # (V, 3) world [m], unit, RGB in [0, 1]
+    faces: Ints2,  # (F, 3)
     projection: Projection,
     R_camera_world: ti.math.mat3,
-    intrinsics: ti.math.vec4,                              # fx, fy, cx, cy of the depth buffer [px]
-    nearest: DepthBuffer,                                  # (s H, s W)
-    light: ti.math.vec4,        # direction to the light in the camera frame; how much shading changes colours, 0..1
-    radius: ti.f32,             # of ambient occlusion [m]
-    taps: ti.i32,               # depth samples for it
-    background: ti.math.vec3,   # RGB in [0, 1]
+    intrinsics: ti.math.vec4,  # fx, fy, cx, cy of the depth buffer [px]
+    nearest: DepthBuffer,  # (s H, s W)
+    light: ti.math.vec4,  # direction to the light in the camera frame; how much shading changes colours, 0..1
+    radius: ti.f32,  # of ambient occlusion [m]
+    taps: ti.i32,  # depth samples for it
+    background: ti.math.vec3,  # RGB in [0, 1]
     # out:
-    image: ti.types.ndarray(dtype=ti.u8, ndim=3),          # (H, W, 3) RGB
+    image: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (H, W, 3) RGB
 ):
-    """Colour of every pixel: the mean over its s x s samples of interpolated vertex colour under soft light."""
+    """Colour of every pixel: the mean over its s x s samples of interpolated vertex colour under
+    soft light.
+    """
     s = nearest.shape[0] // image.shape[0]
     for y, x in ti.ndrange(image.shape[0], image.shape[1]):
         total = ti.math.vec3(0.0)
@@ -142,13 +194,19 @@ def shade_pixels(
             if nearest[v, u] != ti.i64(EMPTY):
                 f = ti.cast(nearest[v, u] & ti.i64(0xFFFFFFFF), ti.i32)
                 a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-                E = edge_functions(project(projection, row3(vertices, a)), project(projection, row3(vertices, b)),
-                                   project(projection, row3(vertices, c)), 0)
+                E = edge_functions(
+                    project(projection, row3(vertices, a)),
+                    project(projection, row3(vertices, b)),
+                    project(projection, row3(vertices, c)),
+                    0,
+                )
                 w = E @ ti.Vector([ti.cast(u, ti.f64), ti.cast(v, ti.f64), ti.cast(1.0, ti.f64)])
                 w = ti.max(w, 0.0) / ti.max(w, 0.0).sum()
                 w0, w1, w2 = ti.cast(w[0], ti.f32), ti.cast(w[1], ti.f32), ti.cast(w[2], ti.f32)
                 rgb = w0 * row3(colors, a) + w1 * row3(colors, b) + w2 * row3(colors, c)
-                n = R_camera_world @ (w0 * row3(normals, a) + w1 * row3(normals, b) + w2 * row3(normals, c))
+                n = R_camera_world @ (
+                    w0 * row3(normals, a) + w1 * row3(normals, b) + w2 * row3(normals, c)
+                )
                 n /= n.norm() + 1e-9
                 lit = 0.5 + 0.5 * n.dot(light.xyz)  # half Lambert: nothing falls into black
                 hidden = occlusion(nearest, v, u, n, intrinsics, radius, taps)

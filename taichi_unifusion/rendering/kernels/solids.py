@@ -1,30 +1,36 @@
-"""Analytic ray casting of a scene of boxes, cylinders and spheres, and the noise of a Kinect's depth.
+"""Analytic ray casting of a scene of boxes, cylinders and spheres, and the noise of a Kinect's
+depth.
 
-Every primitive is a *unit* solid (|x|, |y|, |z| <= 1; x^2 + y^2 <= 1 and |z| <= 1; |x| <= 1) under an affine map, and one of
-them is the room, seen from within. Noise depends on (seed, frame, pixel) alone, never on the order of evaluation.
+Every primitive is a *unit* solid (|x|, |y|, |z| <= 1; x^2 + y^2 <= 1 and |z| <= 1; |x| <= 1) under
+an affine map, and one of them is the room, seen from within. Noise depends on (seed, frame, pixel)
+alone, never on the order of evaluation.
 """
 
 import taichi as ti
 
 ROOM, BOX, CYLINDER, SPHERE = range(4)
 
-TILE = 16          # pixels per side of a culling tile
-FAR = 1e9          # no hit
+TILE = 16  # pixels per side of a culling tile
+FAR = 1e9  # no hit
 TAU = 6.2831853
 
-# Kinect v1: axial noise after Nguyen et al. 2012 (Eq. 3 and its grazing term), lateral noise 0.7 px at edges
-LATERAL = 0.7                # [px]
-AXIAL = (0.0012, 0.0019)     # [m], [1/m]: sigma = a + b (z - 0.4)^2
-GRAZING = 0.0001             # [m^1.5]: + c / sqrt(z) * theta^2 / (pi/2 - theta)^2
-EDGE_GAP = 0.03              # a neighbour nearer or farther by this share of z is another surface
-BASELINE = 0.075             # [m] between the projector, on the right, and the camera
-DISPARITY_STEPS = 8 * 575 * BASELINE  # [1/m] steps of 1/8 px of the sensor's own 640 px image, 575 px focal length
+# Kinect v1: axial noise after Nguyen et al. 2012 (Eq. 3 and its grazing term), lateral noise 0.7 px
+# at edges
+LATERAL = 0.7  # [px]
+AXIAL = (0.0012, 0.0019)  # [m], [1/m]: sigma = a + b (z - 0.4)^2
+GRAZING = 0.0001  # [m^1.5]: + c / sqrt(z) * theta^2 / (pi/2 - theta)^2
+EDGE_GAP = 0.03  # a neighbour nearer or farther by this share of z is another surface
+BASELINE = 0.075  # [m] between the projector, on the right, and the camera
+# [1/m] steps of 1/8 px of the sensor's own 640 px image, 575 px focal length
+DISPARITY_STEPS = 8 * 575 * BASELINE
 NEAR_LIMIT, FAR_LIMIT = 0.4, 5.5  # [m] no reading outside
 
 
 @ti.func
 def multiply(a: ti.u32, b: ti.u32) -> ti.u32:
-    """The product modulo 2^32, by way of 64 bits: Taichi's debug mode reports every 32-bit overflow."""
+    """The product modulo 2^32, by way of 64 bits: Taichi's debug mode reports every 32-bit
+    overflow.
+    """
     return ti.cast(ti.cast(a, ti.u64) * ti.cast(b, ti.u64) & ti.u64(0xFFFFFFFF), ti.u32)
 
 
@@ -58,7 +64,9 @@ def overlap(a: ti.math.vec2, b: ti.math.vec2):
 
 @ti.func
 def hit_parameter(shape: ti.i32, o: ti.math.vec3, d: ti.math.vec3) -> ti.f32:
-    """First t > 0 at which the ray o + t d enters the unit solid (leaves it, for the room), FAR if it does not."""
+    """First t > 0 at which the ray o + t d enters the unit solid (leaves it, for the room), FAR if
+    it does not.
+    """
     span = ti.math.vec2(-FAR, FAR)
     if shape == ROOM or shape == BOX:
         span = overlap(overlap(slab(o[0], d[0]), slab(o[1], d[1])), slab(o[2], d[2]))
@@ -85,27 +93,37 @@ def to_local(T_local_camera: ti.template(), j: ti.i32, x: ti.math.vec3):
     """Linear part of primitive j's map applied to x."""
     y = ti.math.vec3(0.0)
     for r in ti.static(range(3)):
-        y[r] = T_local_camera[j, r, 0] * x[0] + T_local_camera[j, r, 1] * x[1] + T_local_camera[j, r, 2] * x[2]
+        y[r] = (
+            T_local_camera[j, r, 0] * x[0]
+            + T_local_camera[j, r, 1] * x[1]
+            + T_local_camera[j, r, 2] * x[2]
+        )
     return y
 
 
 @ti.kernel
 def cast_rays(
     # in:
-    intrinsics: ti.math.vec4,                                   # fx, fy, cx, cy [px]
-    shapes: ti.types.ndarray(dtype=ti.i32, ndim=1),             # (P,) ROOM, BOX, CYLINDER or SPHERE
-    T_local_camera: ti.types.ndarray(dtype=ti.f32, ndim=3),     # (P, 3, 4) camera [m] -> unit solid
-    nearest: ti.types.ndarray(dtype=ti.f32, ndim=1),            # (P,) no point of it has a smaller depth [m]
-    tile_starts: ti.types.ndarray(dtype=ti.i32, ndim=1),        # (tiles + 1,) rows of tile_members, tiles row by row
-    tile_members: ti.types.ndarray(dtype=ti.i32, ndim=1),       # primitives that may show in a tile, nearest first
+    intrinsics: ti.math.vec4,  # fx, fy, cx, cy [px]
+    shapes: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,) ROOM, BOX, CYLINDER or SPHERE
+    T_local_camera: ti.types.ndarray(dtype=ti.f32, ndim=3),  # (P, 3, 4) camera [m] -> unit solid
+    nearest: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (P,) no point of it has a smaller depth [m]
+    tile_starts: ti.types.ndarray(
+        dtype=ti.i32, ndim=1
+    ),  # (tiles + 1,) rows of tile_members, tiles row by row
+    tile_members: ti.types.ndarray(
+        dtype=ti.i32, ndim=1
+    ),  # primitives that may show in a tile, nearest first
     # out:
-    depth: ti.types.ndarray(dtype=ti.f32, ndim=2),              # (H, W) [m], 0 where nothing is hit
-    hit: ti.types.ndarray(dtype=ti.i32, ndim=2),                # (H, W) primitive, -1 where nothing is hit
+    depth: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W) [m], 0 where nothing is hit
+    hit: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (H, W) primitive, -1 where nothing is hit
 ):
     """First surface along the ray of every pixel; t is depth, because rays have unit z."""
     tiles_x = (depth.shape[1] + TILE - 1) // TILE
     for v, u in depth:
-        ray = ti.math.vec3((u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0)
+        ray = ti.math.vec3(
+            (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
+        )
         best, winner = FAR, -1
         tile = v // TILE * tiles_x + u // TILE
         row, end = tile_starts[tile], tile_starts[tile + 1]
@@ -115,7 +133,9 @@ def cast_rays(
             if nearest[j] > best:
                 row = end
             else:
-                o = ti.math.vec3(T_local_camera[j, 0, 3], T_local_camera[j, 1, 3], T_local_camera[j, 2, 3])
+                o = ti.math.vec3(
+                    T_local_camera[j, 0, 3], T_local_camera[j, 1, 3], T_local_camera[j, 2, 3]
+                )
                 t = hit_parameter(shapes[j], o, to_local(T_local_camera, j, ray))
                 if t < best:
                     best, winner = t, j
@@ -134,14 +154,20 @@ def gaussians(key: ti.u32):
 @ti.kernel
 def kinect_depth(
     # in:
-    exact: ti.types.ndarray(dtype=ti.f32, ndim=2),   # (H, W) [m], 0 where nothing is hit
+    exact: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W) [m], 0 where nothing is hit
     cosine: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W) of the angle of incidence
     closest: ti.f32,  # smallest exact depth of a hit [m]: bounds the projector's shadow
-    seed: ti.i32, frame: ti.i32, fx: ti.f32,
+    seed: ti.i32,
+    frame: ti.i32,
+    fx: ti.f32,
     # out:
-    depth: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W) [m] in whole millimetres, 0 where no reading
+    depth: ti.types.ndarray(
+        dtype=ti.f32, ndim=2
+    ),  # (H, W) [m] in whole millimetres, 0 where no reading
 ):
-    """What a Kinect v1 would read: lateral and axial noise, projector shadow, grazing drop-outs, disparity and mm steps."""
+    """What a Kinect v1 would read: lateral and axial noise, projector shadow, grazing drop-outs,
+    disparity and mm steps.
+    """
     height, width = exact.shape[0], exact.shape[1]
     baseline_focal = BASELINE * fx
     stream = hash32(ti.cast(seed, ti.u32) ^ hash32(ti.cast(frame, ti.u32) ^ ti.u32(0x9E3779B9)))
@@ -154,10 +180,17 @@ def kinect_depth(
             y, x = v, u  # the same surface: its noise is all in the axial term
         z = exact[y, x]
         lit = 1
-        reach = ti.min(ti.cast(baseline_focal * (1.0 / closest - 1.0 / ti.max(z, closest)), ti.i32), width - 1 - x)
+        reach = ti.min(
+            ti.cast(baseline_focal * (1.0 / closest - 1.0 / ti.max(z, closest)), ti.i32),
+            width - 1 - x,
+        )
         k = 1
-        while k <= reach:  # an occluder k pixels to the right hides the point from the projector on that side
-            if exact[y, x + k] > 0.0 and exact[y, x + k] * (baseline_focal + k * z) <= baseline_focal * z:
+        # an occluder k pixels to the right hides the point from the projector on that side
+        while k <= reach:
+            if (
+                exact[y, x + k] > 0.0
+                and exact[y, x + k] * (baseline_focal + k * z) <= baseline_focal * z
+            ):
                 lit = 0
                 k = reach
             k += 1

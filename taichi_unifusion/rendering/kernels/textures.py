@@ -1,25 +1,46 @@
 """Colour of a scene of analytic primitives: solid textures and soft light, baked into the surface.
 
-A colour depends on the surface point and its normal alone, never on the view, so that two frames that see a point agree.
+A colour depends on the surface point and its normal alone, never on the view, so that two frames
+that see a point agree.
 """
 
 import taichi as ti
 
 from .solids import CYLINDER, ROOM, SPHERE, TAU, multiply, to_local, uniform
 
-PATTERNS = {name: i for i, name in enumerate(
-    ("plain", "planks", "wallpaper", "weave", "bands", "landscape", "mosaic", "rug", "panels", "globe"))}
+PATTERNS = {
+    name: i
+    for i, name in enumerate(
+        (
+            "plain",
+            "planks",
+            "wallpaper",
+            "weave",
+            "bands",
+            "landscape",
+            "mosaic",
+            "rug",
+            "panels",
+            "globe",
+        )
+    )
+}
 PLAIN, PLANKS, WALLPAPER, WEAVE, BANDS, LANDSCAPE, MOSAIC, RUG, PANELS, GLOBE = PATTERNS.values()
 
-GRAIN_CELLS = (0.1, 0.033, 0.011)  # [m] lattice of the three octaves of grain; the finest makes detail of about 1 cm
-GROUND = 0.02      # [m] surfaces below it and facing up receive the furniture's baked shadow
+# [m] lattice of the three octaves of grain; the finest makes detail of about 1 cm
+GRAIN_CELLS = (0.1, 0.033, 0.011)
+GROUND = 0.02  # [m] surfaces below it and facing up receive the furniture's baked shadow
 
 
 @ti.func
 def lattice(i: ti.i32, j: ti.i32, k: ti.i32, seed: ti.i32) -> ti.f32:
     """A number in (0, 1) for each corner of an integer lattice."""
-    key = multiply(ti.cast(i, ti.u32), ti.u32(0x9E3779B1)) ^ multiply(ti.cast(j, ti.u32), ti.u32(0x85EBCA77))
-    key ^= multiply(ti.cast(k, ti.u32), ti.u32(0xC2B2AE3D)) ^ multiply(ti.cast(seed, ti.u32), ti.u32(0x27D4EB2F))
+    key = multiply(ti.cast(i, ti.u32), ti.u32(0x9E3779B1)) ^ multiply(
+        ti.cast(j, ti.u32), ti.u32(0x85EBCA77)
+    )
+    key ^= multiply(ti.cast(k, ti.u32), ti.u32(0xC2B2AE3D)) ^ multiply(
+        ti.cast(seed, ti.u32), ti.u32(0x27D4EB2F)
+    )
     return uniform(key)
 
 
@@ -40,7 +61,11 @@ def grain_at(q: ti.math.vec3, seed: ti.i32):
         value = 0.0
         for corner in range(8):
             a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-            w = (a * f[0] + (1 - a) * (1 - f[0])) * (b * f[1] + (1 - b) * (1 - f[1])) * (c * f[2] + (1 - c) * (1 - f[2]))
+            w = (
+                (a * f[0] + (1 - a) * (1 - f[0]))
+                * (b * f[1] + (1 - b) * (1 - f[1]))
+                * (c * f[2] + (1 - c) * (1 - f[2]))
+            )
             value += w * lattice(i[0] + a, i[1] + b, i[2] + c, seed + o)
         for axis in ti.static(range(3)):
             octaves[axis] += value * ti.cast(o == axis, ti.f32)
@@ -50,16 +75,24 @@ def grain_at(q: ti.math.vec3, seed: ti.i32):
 @ti.func
 def line(x: ti.f32, period: ti.f32, width: ti.f32) -> ti.f32:
     """1 on soft lines of the given width at the multiples of period, 0 between them [m]."""
-    return 1.0 - ti.math.smoothstep(0.3 * width, 0.7 * width, ti.abs(x - period * ti.round(x / period)))
+    return 1.0 - ti.math.smoothstep(
+        0.3 * width, 0.7 * width, ti.abs(x - period * ti.round(x / period))
+    )
 
 
 @ti.func
 def unit_normal(shape: ti.i32, p: ti.math.vec3):
-    """Gradient of the unit solid's surface at its point p: outward, into the room for the room; not normalised."""
+    """Gradient of the unit solid's surface at its point p: outward, into the room for the room; not
+    normalised.
+    """
     a = ti.abs(p)
     n = p
     if shape == CYLINDER:
-        n = ti.math.vec3(p[0], p[1], 0.0) if p[0] * p[0] + p[1] * p[1] > a[2] else ti.math.vec3(0.0, 0.0, p[2])
+        n = (
+            ti.math.vec3(p[0], p[1], 0.0)
+            if p[0] * p[0] + p[1] * p[1] > a[2]
+            else ti.math.vec3(0.0, 0.0, p[2])
+        )
     elif shape != SPHERE:
         n = ti.math.vec3(0.0)
         if a[0] >= a[1] and a[0] >= a[2]:
@@ -75,7 +108,9 @@ def unit_normal(shape: ti.i32, p: ti.math.vec3):
 
 @ti.func
 def surface_coordinates(shape: ti.i32, n: ti.math.vec3, p: ti.math.vec3, half: ti.math.vec3):
-    """Coordinates (s, t) on the face of p and its half extents (S, T) [m]; s runs along the longer side."""
+    """Coordinates (s, t) on the face of p and its half extents (S, T) [m]; s runs along the longer
+    side.
+    """
     q = p * half
     st = ti.math.vec4(q[0], q[1], half[0], half[1])
     if (shape == CYLINDER and n[2] == 0.0) or shape == SPHERE:
@@ -91,8 +126,12 @@ def surface_coordinates(shape: ti.i32, n: ti.math.vec3, p: ti.math.vec3, half: t
 
 
 @ti.func
-def pattern_weights(pattern: ti.i32, size: ti.f32, st: ti.math.vec4, grain: ti.math.vec3, seed: ti.i32):
-    """Weights of a material's second and third colour and a tone factor, at (s, t) on a face with half extents (S, T)."""
+def pattern_weights(
+    pattern: ti.i32, size: ti.f32, st: ti.math.vec4, grain: ti.math.vec3, seed: ti.i32
+):
+    """Weights of a material's second and third colour and a tone factor, at (s, t) on a face with
+    half extents (S, T).
+    """
     s, t = st[0], st[1]
     second, third, tone = grain[1], 0.0, 1.0
     if pattern == PLANKS:
@@ -103,9 +142,16 @@ def pattern_weights(pattern: ti.i32, size: ti.f32, st: ti.math.vec4, grain: ti.m
     elif pattern == WALLPAPER:
         rank = ti.floor(s / size + 0.5, ti.i32)
         second = 0.8 * ti.cast(rank % 2, ti.f32) + 0.2 * grain[1]
-        a, b = s - size * rank, t - size * (ti.round(t / size - 0.5 * (rank % 2)) + 0.5 * (rank % 2))
+        a, b = (
+            s - size * rank,
+            t - size * (ti.round(t / size - 0.5 * (rank % 2)) + 0.5 * (rank % 2)),
+        )
         r = ti.abs(a) + 0.7 * ti.abs(b)
-        third = line(r - 0.2 * size, 10.0, 0.016) + 1.0 - ti.math.smoothstep(0.006, 0.012, ti.sqrt(a * a + b * b))
+        third = (
+            line(r - 0.2 * size, 10.0, 0.016)
+            + 1.0
+            - ti.math.smoothstep(0.006, 0.012, ti.sqrt(a * a + b * b))
+        )
     elif pattern == WEAVE:
         second = 0.5 + 0.25 * ti.sin(s * TAU / size) + 0.25 * ti.sin(t * TAU / size)
         third = 0.6 * ti.max(line(s, 6.0 * size, 0.4 * size), line(t, 6.0 * size, 0.4 * size))
@@ -114,15 +160,23 @@ def pattern_weights(pattern: ti.i32, size: ti.f32, st: ti.math.vec4, grain: ti.m
         third = line(t - 0.35 * size, size, 0.12 * size) * ti.math.smoothstep(0.3, 0.4, grain[2])
     elif pattern == LANDSCAPE:
         x, y = s / st[2], t / st[3]
-        ridge = 0.35 * ti.sin(2.3 * x + seed) + 0.14 * ti.sin(7.1 * x + 2 * seed) + 0.25 * (grain[1] - 0.5)
+        ridge = (
+            0.35 * ti.sin(2.3 * x + seed)
+            + 0.14 * ti.sin(7.1 * x + 2 * seed)
+            + 0.25 * (grain[1] - 0.5)
+        )
         second = ti.math.smoothstep(-0.04, 0.04, 0.1 + ridge - y)
         third = ti.math.smoothstep(-0.05, 0.05, -0.35 - 0.7 * ridge - y)
-        tone = 1.0 + 0.25 * y - 0.35 * line(ti.min(st[2] - ti.abs(s), st[3] - ti.abs(t)), 10.0, 0.05)
+        tone = (
+            1.0 + 0.25 * y - 0.35 * line(ti.min(st[2] - ti.abs(s), st[3] - ti.abs(t)), 10.0, 0.05)
+        )
     elif pattern == MOSAIC:
         i, j = ti.floor(s / size, ti.i32), ti.floor(t / size, ti.i32)
         second = ti.floor(3.0 * lattice(i, j, 1, seed)) * 0.5
         third = ti.cast(lattice(i, j, 2, seed) > 0.72, ti.f32)
-        tone = (0.8 + 0.3 * lattice(i, j, 3, seed)) * (1.0 - 0.4 * ti.max(line(s, size, 0.008), line(t, size, 0.008)))
+        tone = (0.8 + 0.3 * lattice(i, j, 3, seed)) * (
+            1.0 - 0.4 * ti.max(line(s, size, 0.008), line(t, size, 0.008))
+        )
     elif pattern == RUG:
         border = ti.min(st[2] - ti.abs(s), st[3] - ti.abs(t))
         inner = ti.math.smoothstep(0.16, 0.17, border)
@@ -145,8 +199,12 @@ def pattern_weights(pattern: ti.i32, size: ti.f32, st: ti.math.vec4, grain: ti.m
 
 
 @ti.func
-def daylight(x: ti.math.vec3, n: ti.math.vec3, room_low: ti.math.vec3, room_high: ti.math.vec3) -> ti.f32:
-    """Soft diffuse light at world point x [m] with normal n: sky, a window to the west, a ceiling lamp, darker corners."""
+def daylight(
+    x: ti.math.vec3, n: ti.math.vec3, room_low: ti.math.vec3, room_high: ti.math.vec3
+) -> ti.f32:
+    """Soft diffuse light at world point x [m] with normal n: sky, a window to the west, a ceiling
+    lamp, darker corners.
+    """
     shade = 0.58 + 0.08 * n[2]
     for light in ti.static(((-1.5, 0.2, 1.9, 0.34), (0.4, 0.0, 2.3, 0.30))):
         ray = ti.math.vec3(light[0], light[1], light[2]) - x
@@ -162,26 +220,44 @@ def daylight(x: ti.math.vec3, n: ti.math.vec3, room_low: ti.math.vec3, room_high
 def ground_light(ground: ti.template(), share: ti.math.vec3) -> ti.f32:
     """The floor's shadow, bilinear, at a place given as shares of the room's sides."""
     x, y = share[0] * (ground.shape[0] - 1), share[1] * (ground.shape[1] - 1)
-    i, j = ti.math.clamp(ti.cast(x, ti.i32), 0, ground.shape[0] - 2), ti.math.clamp(ti.cast(y, ti.i32), 0, ground.shape[1] - 2)
-    return ti.math.mix(ti.math.mix(ground[i, j], ground[i + 1, j], x - i),
-                       ti.math.mix(ground[i, j + 1], ground[i + 1, j + 1], x - i), y - j)
+    i, j = (
+        ti.math.clamp(ti.cast(x, ti.i32), 0, ground.shape[0] - 2),
+        ti.math.clamp(ti.cast(y, ti.i32), 0, ground.shape[1] - 2),
+    )
+    return ti.math.mix(
+        ti.math.mix(ground[i, j], ground[i + 1, j], x - i),
+        ti.math.mix(ground[i, j + 1], ground[i + 1, j + 1], x - i),
+        y - j,
+    )
 
 
 @ti.kernel
 def shade_surfaces(
     # in:
-    intrinsics: ti.math.vec4, T_world_camera: ti.math.mat4,
-    room_low: ti.math.vec3, room_high: ti.math.vec3,            # inner corners of the room, world [m]
-    depth: ti.types.ndarray(dtype=ti.f32, ndim=2), hit: ti.types.ndarray(dtype=ti.i32, ndim=2),  # of cast_rays
-    shapes: ti.types.ndarray(dtype=ti.i32, ndim=1), T_local_camera: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    half_extents: ti.types.ndarray(dtype=ti.f32, ndim=2),       # (P, 3) [m]
-    materials: ti.types.ndarray(dtype=ti.i32, ndim=2),          # (P, 4) row of looks for the faces across x, y, below, above
-    patterns: ti.types.ndarray(dtype=ti.i32, ndim=1),           # (M,) number in PATTERNS
-    looks: ti.types.ndarray(dtype=ti.f32, ndim=2),              # (M, 12) size [m], grain, stretch, three RGB colours
-    ground: ti.types.ndarray(dtype=ti.f32, ndim=2),             # (X, Y) shadow on the floor, 1 where none, corner to corner
+    intrinsics: ti.math.vec4,
+    T_world_camera: ti.math.mat4,
+    room_low: ti.math.vec3,
+    room_high: ti.math.vec3,  # inner corners of the room, world [m]
+    depth: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    hit: ti.types.ndarray(dtype=ti.i32, ndim=2),  # of cast_rays
+    shapes: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    T_local_camera: ti.types.ndarray(dtype=ti.f32, ndim=3),
+    half_extents: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (P, 3) [m]
+    materials: ti.types.ndarray(
+        dtype=ti.i32, ndim=2
+    ),  # (P, 4) row of looks for the faces across x, y, below, above
+    patterns: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,) number in PATTERNS
+    looks: ti.types.ndarray(
+        dtype=ti.f32, ndim=2
+    ),  # (M, 12) size [m], grain, stretch, three RGB colours
+    ground: ti.types.ndarray(
+        dtype=ti.f32, ndim=2
+    ),  # (X, Y) shadow on the floor, 1 where none, corner to corner
     # out:
-    color: ti.types.ndarray(dtype=ti.u8, ndim=3),               # (H, W, 3) RGB
-    cosine: ti.types.ndarray(dtype=ti.f32, ndim=2),             # (H, W) between the normal and the direction to the camera
+    color: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (H, W, 3) RGB
+    cosine: ti.types.ndarray(
+        dtype=ti.f32, ndim=2
+    ),  # (H, W) between the normal and the direction to the camera
 ):
     """Colour of the surface that each pixel sees."""
     for v, u in depth:
@@ -189,11 +265,15 @@ def shade_surfaces(
         rgb = ti.math.vec3(0.0)
         cosine[v, u] = 0.0
         if j >= 0:
-            ray = ti.math.vec3((u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0)
+            ray = ti.math.vec3(
+                (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
+            )
             at = depth[v, u] * ray
             half = ti.math.vec3(half_extents[j, 0], half_extents[j, 1], half_extents[j, 2])
             p = to_local(T_local_camera, j, at)
-            p += ti.math.vec3(T_local_camera[j, 0, 3], T_local_camera[j, 1, 3], T_local_camera[j, 2, 3])
+            p += ti.math.vec3(
+                T_local_camera[j, 0, 3], T_local_camera[j, 1, 3], T_local_camera[j, 2, 3]
+            )
             n_local = unit_normal(shapes[j], p)
             n_camera = ti.math.vec3(0.0)
             for r in ti.static(range(3)):
@@ -205,7 +285,9 @@ def shade_surfaces(
             x4 = T_world_camera @ ti.math.vec4(at, 1.0)
             n, x = ti.math.vec3(n4[0], n4[1], n4[2]), ti.math.vec3(x4[0], x4[1], x4[2])
 
-            face = 0 if n_local[0] != 0.0 else (1 if n_local[1] != 0.0 else (2 if p[2] < 0.0 else 3))
+            face = (
+                0 if n_local[0] != 0.0 else (1 if n_local[1] != 0.0 else (2 if p[2] < 0.0 else 3))
+            )
             m = materials[j, face]
             st = surface_coordinates(shapes[j], n_local, p, half)
             q = p * half
@@ -220,7 +302,9 @@ def shade_surfaces(
             for c in ti.static(range(3)):
                 rgb[c] = ti.math.mix(looks[m, 3 + c], looks[m, 6 + c], weights[0])
                 rgb[c] = ti.math.mix(rgb[c], looks[m, 9 + c], weights[1])
-            rgb *= weights[2] * (1.0 + looks[m, 1] * (0.5 * grain[0] + 0.8 * grain[1] + 0.7 * grain[2] - 1.0))
+            rgb *= weights[2] * (
+                1.0 + looks[m, 1] * (0.5 * grain[0] + 0.8 * grain[1] + 0.7 * grain[2] - 1.0)
+            )
             light = daylight(x, n, room_low, room_high)
             if x[2] < GROUND and n[2] > 0.5:
                 light *= ground_light(ground, (x - room_low) / (room_high - room_low))

@@ -1,7 +1,7 @@
 """Maps of every kind from two synthetic frames, as hashes.
 
-`python tests/golden/make_maps.py > tests/golden/maps.json` renews what `test_golden.py` compares with: only where a change
-is meant to change maps, in the same commit, which says why.
+`python tests/golden/make_maps.py > tests/golden/maps.json` renews what `test_golden.py` compares
+with: only where a change is meant to change maps, in the same commit, which says why.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from safetensors.numpy import load_file
 
 import taichi_unifusion as uf
-from taichi_unifusion.maps.encoding import EncoderSettings, position_encoding
 from taichi_unifusion.maps import LatentMap, PropertyGroup
+from taichi_unifusion.maps.encoding import EncoderSettings, position_encoding
 
 FRAMES = (0, 2)  # of a loop of 60: most of what one sees, the other sees too
 SIZE = {"width": 320, "height": 240}
@@ -58,7 +58,10 @@ def maps(seen: list[uf.PointCloud]) -> dict[str, object]:
             each.integrate(cloud)
     made["removed"].remove(seen[1])
     made["removed-information"].remove(seen[1])
-    shared = [uf.PropertyMap(name, channels, voxel_size=0.05) for name, channels in (("color", 3), ("grey", 1))]
+    shared = [
+        uf.PropertyMap(name, channels, voxel_size=0.05)
+        for name, channels in (("color", 3), ("grey", 1))
+    ]
     group = PropertyGroup(shared)
     for cloud in seen:
         group.integrate(cloud)
@@ -76,12 +79,20 @@ def summary(array: np.ndarray) -> list[float]:
 
 
 def machine(encoding: np.ndarray) -> str:
-    """What the last bit of a sum depends on: the processor's instructions, Taichi's compiler, the linear algebra library."""
+    """What the last bit of a sum depends on: the processor's instructions, Taichi's compiler, the
+    linear algebra library.
+    """
     try:
-        flags = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags"))
+        flags = next(
+            line
+            for line in Path("/proc/cpuinfo").read_text().splitlines()
+            if line.startswith("flags")
+        )
     except (OSError, StopIteration):
         flags = platform.processor()
-    vectors = sorted(set(flags.split()) & {"avx", "avx2", "fma", "fma4", "xop", "avx512f", "avx512vl"})
+    vectors = sorted(
+        set(flags.split()) & {"avx", "avx2", "fma", "fma4", "xop", "avx512f", "avx512vl"}
+    )
     return f"taichi {version('taichi')}, {'+'.join(vectors)}, encoding {sha256(encoding)}"
 
 
@@ -95,7 +106,11 @@ def arrays() -> dict[str, np.ndarray]:
             each.save(path)
             found |= {f"{kind}.{name}": tensor for name, tensor in load_file(path).items()}
     mesh = made["surface"].extract_mesh(3)
-    found |= {"mesh.vertices": mesh.vertices, "mesh.faces": mesh.faces, "mesh.normals": mesh.normals}
+    found |= {
+        "mesh.vertices": mesh.vertices,
+        "mesh.faces": mesh.faces,
+        "mesh.normals": mesh.normals,
+    }
     found["mesh.color"] = np.asarray(made["color"].query(mesh.vertices))
     return found
 
