@@ -26,7 +26,12 @@ MAX_IMPORT_S = 1.5  # K2; the best of three, so that a busy machine does not dec
 HEAVY = {"torch", "open3d", "trimesh"}
 MAX_FILE_BYTES = 1 << 20
 MAX_REPOSITORY_BYTES = 6 << 20
-IMPORT_NAMES = {"cv2": "opencv-python-headless", "skimage": "scikit-image", "yaml": "pyyaml"}
+IMPORT_NAMES = {
+    "lazy_loader": "lazy-loader",
+    "cv2": "opencv-python-headless",
+    "skimage": "scikit-image",
+    "yaml": "pyyaml",
+}
 
 
 # --- K2: imports ----------------------------------------------------------------------------------------------------
