@@ -324,6 +324,11 @@ class Mesh:
             attributes={**self.attributes, name: values[:, None] if values.ndim == 1 else values},
         )
 
+    def transformed(self, T_b_a: NDArray) -> Mesh:
+        """This mesh of frame a in frame b, by a rigid transform (4, 4); without normals."""
+        vertices = self.vertices @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+        return Mesh(vertices.astype(np.float32), self.faces, None, self.attributes)
+
     def save(self, path) -> None:
         """Write the mesh; the suffix chooses PLY, GLB or OBJ."""
         from .files.meshes import write_mesh

@@ -61,7 +61,6 @@ def evaluate_surface(options: EvaluateSurface) -> int:
     from .. import runtime
     from ..evaluation.surface import evaluate_surface as evaluate
     from ..files.foreign_meshes import read_any_mesh
-    from ..geometry.triangles import transformed
     from ..results.reader import find_run, read_run
 
     run = find_run(options.reconstruction)
@@ -70,7 +69,7 @@ def evaluate_surface(options: EvaluateSurface) -> int:
         raise InputError("surface: give the true mesh too: unifusion evaluate surface MESH TRUTH")
     runtime.init(options.device)
     mesh = (
-        transformed(run.mesh(), run.T_recording_run())
+        run.mesh().transformed(run.T_recording_run())
         if run
         else read_any_mesh(options.reconstruction)
     )

@@ -146,7 +146,7 @@ def transfer_labels(
 
     -1 where none lies within `max_distance` [m]. Raises InputError for points that are not finite or not as many as labels.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     labels = _labels(labels, "labels")
     points, targets = _points(points, "labelled points"), _points(targets, "points to label")
@@ -154,7 +154,7 @@ def transfer_labels(
         raise InputError(f"segmentation: {len(points)} points but {len(labels)} labels")
     if not max_distance > 0:
         raise InputError(f"segmentation: max_distance must be above 0 m, got {max_distance}")
-    distance, nearest = cKDTree(points).query(targets, distance_upper_bound=max_distance)
+    distance, nearest = KDTree(points).query(targets, distance_upper_bound=max_distance)
     return np.where(np.isfinite(distance), labels[np.minimum(nearest, len(labels) - 1)], UNLABELLED)
 
 

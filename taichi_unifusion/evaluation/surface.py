@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..geometry.triangles import SurfaceDistance, check_mesh, sample_surface
+from ..geometry.triangles import SurfaceDistance, sample_surface
+from ..rendering.mesh_checks import check_mesh
 from ..types import Mesh
 from .visibility import Views, points_within_view
 
@@ -91,7 +92,10 @@ def evaluate_surface(
     _check_overlap(reconstruction, ground_truth)
     rng = np.random.default_rng(seed)
     pool = samples * (POOL if views else 1)
-    drawn = sample_surface(reconstruction, pool, rng), sample_surface(ground_truth, pool, rng)
+    drawn = tuple(
+        sample_surface(mesh.vertices, mesh.faces, pool, rng)
+        for mesh in (reconstruction, ground_truth)
+    )
     seen = tuple(np.ones(len(points), bool) for points in drawn)
     if views:
         seen = points_within_view(views, ground_truth, drawn, (BEHIND, OCCLUSION_TOLERANCE))
@@ -100,8 +104,8 @@ def evaluate_surface(
         _thin(points[mask], samples, rng) for points, mask in zip(drawn, seen, strict=True)
     )
     if distance_to == "surface":
-        to_truth = SurfaceDistance(ground_truth)(of_reconstruction)
-        to_reconstruction = SurfaceDistance(reconstruction)(of_truth)
+        to_truth = SurfaceDistance(ground_truth.vertices, ground_truth.faces)(of_reconstruction)
+        to_reconstruction = SurfaceDistance(reconstruction.vertices, reconstruction.faces)(of_truth)
     else:
         to_truth = _distance_to_samples(of_reconstruction, drawn[1][:: POOL if views else 1])
         to_reconstruction = _distance_to_samples(of_truth, drawn[0][:: POOL if views else 1])
@@ -137,9 +141,9 @@ def _thin(points: NDArray, count: int, rng: np.random.Generator) -> NDArray:
 
 
 def _distance_to_samples(points: NDArray, samples: NDArray) -> NDArray[np.float64]:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    return cKDTree(samples).query(points)[0]
+    return KDTree(samples).query(points)[0]
 
 
 def _check_overlap(reconstruction: Mesh, ground_truth: Mesh) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..geometry.triangles import area_vectors
 from ..rendering.raycaster import RayCaster, RayHits
 from ..types import Mesh, PinholeCamera, check_rigid
 
@@ -55,12 +56,13 @@ def points_within_view(
     left = [np.asarray(p, np.float64) for p in points]  # not seen so far
     rows = [np.arange(len(p)) for p in left]  # theirs
     seen = tuple(np.zeros(len(p), bool) for p in left)
-    corners = caster.mesh.vertices[caster.mesh.faces].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    vertices = caster.mesh.vertices.astype(np.float64)
+    corner = vertices[caster.mesh.faces[:, 0]]  # (F, 3) one of each triangle
+    normals = area_vectors(vertices, caster.mesh.faces)
     for T_world_camera in views.T_world_camera:
         hits = caster.cast(views.camera, T_world_camera)
         for k, slack in enumerate(behind):
-            inside = _in_view(views, hits, corners[:, 0], normals, left[k], slack)
+            inside = _in_view(views, hits, corner, normals, left[k], slack)
             seen[k][rows[k][inside]] = True
             left[k], rows[k] = left[k][~inside], rows[k][~inside]
     return seen

@@ -1,14 +1,12 @@
-"""Triangle meshes as evaluation takes them: checked, sampled evenly, and how far points lie from
-their surface.
+"""Triangles as arrays: areas, normals, even samples, and how far points lie from their surface.
+
+Arrays are `vertices` (V, 3) [m] and `faces` (F, 3), three rows of `vertices` each.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-
-from ..errors import InputError
-from ..types import Mesh
 
 # [m] triangles are cut into pieces of at most this edge, to find the nearest ones by their centres
 PIECE_M = 0.04
@@ -19,75 +17,69 @@ EXACT_M = 0.1
 POINT_CHUNK = 5_000  # points measured at once: some 150 MB of intermediate numbers at most
 
 
-def check_mesh(mesh: Mesh, name: str) -> Mesh:
-    """The mesh with arrays as kernels take them; raises InputError where it is empty, not finite or
-    inconsistent.
-
-    `name` says which mesh it is, in messages.
+def area_vectors(vertices: NDArray, faces: NDArray) -> NDArray[np.floating]:
+    """Half the cross product of two edges, (F, 3), in the precision of the vertices (V, 3): as long
+    as the triangle's area [m^2], towards the side from which its corners (F, 3) run
+    counter-clockwise.
     """
-    vertices = np.ascontiguousarray(mesh.vertices, np.float32)
-    faces = np.ascontiguousarray(mesh.faces, np.int32)
-    if not len(faces):
-        raise InputError(
-            f"{name}: has no triangles"
-            + (f", only {len(vertices)} points" if len(vertices) else "")
-        )
-    if not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise InputError(
-            f"{name}: its triangles name vertices {faces.min()}..{faces.max()}, but it has {len(vertices)}"
-        )
-    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
-    if bad:
-        raise InputError(f"{name}: {bad} of {len(vertices)} vertices are not finite numbers")
-    if not triangle_areas(vertices, faces).sum() > 0:
-        raise InputError(f"{name}: its triangles have no area")
-    return Mesh(vertices, faces, mesh.normals, mesh.attributes)
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    return np.cross(b - a, c - a) / 2
 
 
-def triangle_areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
+def areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
     """Areas (F,) [m^2]."""
-    corners = vertices[faces].astype(np.float64)
-    return 0.5 * np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    return np.linalg.norm(area_vectors(np.asarray(vertices, np.float64), faces), axis=1)
+
+
+def vertex_areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
+    """Area (V,) [m^2] that each vertex stands for: a third of its triangles'."""
+    thirds = np.repeat(areas(vertices, faces) / 3, 3)
+    return np.bincount(faces.ravel(), thirds, len(vertices))
+
+
+def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray[np.float32]:
+    """Unit normals (V, 3): the mean of the adjacent faces', weighted by area; 0 without a face."""
+    weighted = np.repeat(area_vectors(vertices, faces), 3, axis=0)
+    sums = np.stack(
+        [np.bincount(faces.ravel(), weighted[:, k], len(vertices)) for k in range(3)], axis=1
     )
+    lengths = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
+    return (sums / lengths).astype(np.float32)
 
 
-def transformed(mesh: Mesh, T_b_a: NDArray) -> Mesh:
-    """The triangles and attributes of a mesh, given in frame a, in frame b; without normals."""
-    vertices = mesh.vertices @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-    return Mesh(vertices.astype(np.float32), mesh.faces, None, mesh.attributes)
-
-
-def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """`count` points (N, 3) drawn evenly over the area of a checked mesh.
+def sample_surface(
+    vertices: NDArray, faces: NDArray, count: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """`count` points (N, 3) drawn evenly over the area of the triangles, which must not be 0.
 
     Stratified along the list of triangles: each of `count` equal shares of the area gives one
     point, so that the sample varies less than independent draws would.
     """
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    total = np.cumsum(triangle_areas(mesh.vertices, mesh.faces))
+    total = np.cumsum(areas(vertices, faces))
     picked = np.searchsorted(
         total, (np.arange(count) + rng.random(count)) * (total[-1] / count), side="right"
     )
+    corners = vertices[faces].astype(np.float64)
     a, b, c = corners[np.minimum(picked, len(corners) - 1)].swapaxes(0, 1)
     root, share = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
     return (1 - root) * a + root * (1 - share) * b + root * share * c
 
 
 class SurfaceDistance:
-    """Distances from points to the surface of a checked mesh.
+    """Distances from points to the surface of finite triangles, of which there is at least one.
 
     A point is measured exactly against the triangles whose pieces have the nearest centres. Within
     10 cm no triangle that could be nearer is left out, unless more than 96 pieces crowd there;
     farther off a distance may come out millimetres too long.
     """
 
-    def __init__(self, mesh: Mesh) -> None:
-        from scipy.spatial import cKDTree
+    def __init__(self, vertices: NDArray, faces: NDArray) -> None:
+        from scipy.spatial import KDTree
 
-        self.corners = mesh.vertices[mesh.faces].astype(np.float64)  # (F, 3, 3)
-        centers, self.owner, self.radius = _pieces(self.corners)
-        self.tree = cKDTree(centers, balanced_tree=False, compact_nodes=False)
+        area = float(areas(vertices, faces).sum())
+        self.corners = vertices[faces].astype(np.float64)  # (F, 3, 3)
+        centers, self.owner, self.radius = _pieces(self.corners, area)
+        self.tree = KDTree(centers, balanced_tree=False, compact_nodes=False)
 
     def __call__(self, points: NDArray) -> NDArray[np.float64]:
         """Distances (N,) [m] of points (N, 3)."""
@@ -125,16 +117,10 @@ class SurfaceDistance:
         ), reach[:, -1]
 
 
-def _pieces(corners: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64], float]:
-    """Centres (P, 3) of the pieces of triangles, cut in half until short, the triangle (P,) of
-    each, and the largest radius.
+def _pieces(corners: NDArray, area: float) -> tuple[NDArray[np.float64], NDArray[np.int64], float]:
+    """Centres (P, 3) of the pieces of triangles (F, 3, 3) of this total area [m^2], cut in half
+    until short; the triangle (P,) of each; and the largest radius [m].
     """
-    area = (
-        0.5
-        * np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        ).sum()
-    )
     # halving leaves pieces of a sixteenth of its square on average
     edge = max(PIECE_M, 4 * np.sqrt(area / MAX_PIECES))
     centers, owners, radius, owner = [], [], 0.0, np.arange(len(corners))

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import runtime
 from ..errors import InputError
+from ..geometry.triangles import vertex_areas
 from ..types import Mesh
 
 THRESHOLD = 0.5  # relevance above which a vertex belongs to a region: it beats all rivals
@@ -33,8 +35,8 @@ def find_regions(
 
     Raises InputError for a relevance of another mesh or a threshold outside 0..1.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    runtime.current()  # before Taichi is imported: it says what it starts
+    from ..maps.meshing import connected_parts
 
     count = len(mesh.vertices)
     if relevance.shape != (count,):
@@ -46,9 +48,12 @@ def find_regions(
     inside = relevance >= threshold
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     edges = edges[inside[edges].all(axis=1)]
-    graph = coo_matrix((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), (count, count))
-    part = connected_components(graph, directed=False)[1]
-    areas = vertex_areas(mesh)
+    part = (
+        connected_parts(np.ascontiguousarray(edges[:, [0, 1, 1]]), count)
+        if len(edges)
+        else np.arange(count)
+    )
+    areas = vertex_areas(mesh.vertices, mesh.faces)
     vertices = np.flatnonzero(inside)
     order = vertices[np.argsort(part[vertices], kind="stable")]
     groups = np.split(order, np.flatnonzero(np.diff(part[order])) + 1) if len(order) else []
@@ -58,16 +63,6 @@ def find_regions(
         if areas[group].sum() >= max(min_area, 1e-12)
     ]
     return sorted(regions, key=lambda region: -(region.score - threshold) * region.area)
-
-
-def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
-    """Area (V,) [m^2] that each vertex stands for: a third of its triangles'."""
-    corner = mesh.vertices[mesh.faces].astype(np.float64)
-    areas = (
-        np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-        / 6
-    )
-    return np.bincount(mesh.faces.ravel(), np.repeat(areas, 3), len(mesh.vertices))
 
 
 def _region(mesh: Mesh, relevance: NDArray, areas: NDArray, group: NDArray) -> Region:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
+from ..geometry.triangles import areas
 from ..kernels import marching_cubes as kernels
 from ..kernels import query
 from ..kernels.visibility import interpolate_evidence
@@ -135,20 +136,8 @@ def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
     """
     if min_area <= 0 or not len(mesh.faces):
         return mesh
-    part, changed = np.arange(len(mesh.vertices), dtype=np.int32), np.ones(1, np.int32)
-    while changed[0]:
-        changed[0] = 0
-        kernels.join_parts(mesh.faces, part, changed)
-        runtime.synchronize()
-    a = mesh.faces[:, 0]
-    corners = mesh.vertices[mesh.faces]
-    areas = (
-        np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        )
-        / 2
-    )
-    kept = np.bincount(part[a], areas)[part] >= min_area  # (V,)
+    part, a = connected_parts(mesh.faces, len(mesh.vertices)), mesh.faces[:, 0]
+    kept = np.bincount(part[a], areas(mesh.vertices, mesh.faces))[part] >= min_area  # (V,)
     renumber = (np.cumsum(kept) - 1).astype(np.int32)
     return Mesh(
         mesh.vertices[kept],
@@ -156,6 +145,16 @@ def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
         None if mesh.normals is None else mesh.normals[kept],
         {name: values[kept] for name, values in mesh.attributes.items()},
     )
+
+
+def connected_parts(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
+    """For each of so many vertices, the first vertex (V,) of the part that its faces connect it to."""
+    part, changed = np.arange(vertices, dtype=np.int32), np.ones(1, np.int32)
+    while changed[0]:
+        changed[0] = 0
+        kernels.join_parts(faces, part, changed)
+        runtime.synchronize()
+    return part
 
 
 def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:

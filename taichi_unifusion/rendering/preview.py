@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..errors import InputError
 from ..files.atomic import atomic_write
+from ..geometry.triangles import area_vectors, vertex_normals
 from ..types import Mesh, PinholeCamera, Trajectory, check_rigid
 
 VIEWS = {  # name -> what it shows
@@ -138,7 +139,7 @@ def _drawable(mesh: Mesh) -> _Drawable:
     if not len(faces):
         raise InputError("preview: the mesh is empty, there is nothing to draw")
     normals = (
-        _vertex_normals(vertices, faces) if mesh.normals is None else np.nan_to_num(mesh.normals)
+        vertex_normals(vertices, faces) if mesh.normals is None else np.nan_to_num(mesh.normals)
     )
     color = mesh.attributes.get("color")
     if color is not None and color.shape[1:] != (3,):
@@ -156,19 +157,6 @@ def _drawable(mesh: Mesh) -> _Drawable:
         np.ascontiguousarray(normals, np.float32),
         np.ascontiguousarray(colors, np.float32),
         SHADING[color is not None],
-    )
-
-
-def _vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray[np.float32]:
-    """Unit normals (V, 3): the mean of the adjacent faces', weighted by area."""
-    corner = vertices[faces]
-    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    weights = np.repeat(normals, 3, axis=0)
-    total = np.stack(
-        [np.bincount(faces.ravel(), weights[:, k], len(vertices)) for k in range(3)], axis=1
-    )
-    return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)).astype(
-        np.float32
     )
 
 
@@ -258,19 +246,16 @@ def _choose_views(
 
 
 def _sample_surface(drawable: _Drawable, count: int = 30_000) -> _Surface:
-    corners = drawable.vertices[drawable.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).astype(
-        np.float64
-    )
-    double_areas = np.linalg.norm(normals, axis=1)
-    total = np.cumsum(double_areas)
+    vectors = area_vectors(drawable.vertices, drawable.faces).astype(np.float64)
+    areas = np.linalg.norm(vectors, axis=1)
+    total = np.cumsum(areas)
     if not 0 < total[-1] < math.inf:
         raise InputError(
             "preview: the triangles of the mesh have no area, or are too large to draw"
         )
     picked = np.searchsorted(total, (np.arange(count) + 0.5) * (total[-1] / count))
-    corners = corners[picked].astype(np.float64)
-    return _Surface(corners, corners.mean(axis=1), normals[picked] / double_areas[picked, None])
+    corners = drawable.vertices[drawable.faces[picked]].astype(np.float64)
+    return _Surface(corners, corners.mean(axis=1), vectors[picked] / areas[picked, None])
 
 
 def _shown_area(surface: _Surface, directions: NDArray) -> NDArray[np.float64]:

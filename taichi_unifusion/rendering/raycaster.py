@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..geometry.triangles import check_mesh
 from ..types import Mesh, PinholeCamera, check_rigid
+from .mesh_checks import check_mesh
 
 NEAR = 1e-3  # [m] nothing nearer to the camera is hit
 

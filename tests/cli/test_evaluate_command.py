@@ -354,7 +354,7 @@ def test_a_tracked_run_is_fitted_to_the_recording(results, truth, evaluate, tmp_
     metrics = json.loads((folder / "metrics.json").read_text()) | {"tracking": {"mode": "rgbd"}}
     (folder / "metrics.json").write_text(json.dumps(metrics))
     mesh, path = read_mesh(folder / "mesh.ply"), read_trajectory(folder / "trajectory.txt")
-    geometry.transformed(mesh, T).save(folder / "mesh.ply")
+    mesh.transformed(T).save(folder / "mesh.ply")
     write_trajectory(
         folder / "trajectory.txt", Trajectory(path.timestamps, T @ path.T_world_camera)
     )

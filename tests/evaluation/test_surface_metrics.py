@@ -28,11 +28,11 @@ from taichi_unifusion.geometry.triangles import (
     CANDIDATES,
     EXACT_M,
     SurfaceDistance,
-    check_mesh,
+    areas,
     sample_surface,
     squared_distance_to_triangles,
-    triangle_areas,
 )
+from taichi_unifusion.rendering.mesh_checks import check_mesh
 
 SAMPLES = 4000
 SHARE = 0.02  # of a share estimated from 4000 points: 2.5 sigma at most, and ours are stratified
@@ -124,9 +124,9 @@ def test_N5_the_seed_decides():
 
 def test_samples_lie_on_the_surface_in_proportion_to_area():
     mesh = random_soup(12, 4)
-    points = sample_surface(mesh, 20_000, np.random.default_rng(0))
-    areas = triangle_areas(mesh.vertices, mesh.faces)
-    edges = np.concatenate([[0], np.cumsum(areas)]) / areas.sum() * len(points)
+    points = sample_surface(mesh.vertices, mesh.faces, 20_000, np.random.default_rng(0))
+    area = areas(mesh.vertices, mesh.faces)
+    edges = np.concatenate([[0], np.cumsum(area)]) / area.sum() * len(points)
     for (first, last), corners in zip(
         pairwise(edges), mesh.vertices[mesh.faces].astype(float), strict=True
     ):
@@ -182,7 +182,7 @@ def test_distances_are_those_of_every_triangle(mesh):
             0,
         )
     )
-    measure = SurfaceDistance(mesh)
+    measure = SurfaceDistance(mesh.vertices, mesh.faces)
     found, near = measure(points), known < EXACT_M
     np.testing.assert_allclose(found[near], known[near], atol=ROUNDING)
     assert ((found >= known - ROUNDING) & (found <= known + measure.radius)).all()
@@ -196,14 +196,14 @@ def test_distances_agree_with_open3d():
     known = open3d_scene(mesh).compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
     near = known < EXACT_M
     assert near.sum() > 100
-    np.testing.assert_allclose(SurfaceDistance(mesh)(points)[near], known[near], atol=ROUNDING)
+    np.testing.assert_allclose(
+        SurfaceDistance(mesh.vertices, mesh.faces)(points)[near], known[near], atol=ROUNDING
+    )
 
 
 def test_fewer_pieces_than_candidates():
-    assert (
-        SurfaceDistance(mesh_of([(0, 0, 0), (1e-3, 0, 0), (0, 1e-3, 0)], [(0, 1, 2)])).tree.n
-        < CANDIDATES[0]
-    )
+    mesh = mesh_of([(0, 0, 0), (1e-3, 0, 0), (0, 1e-3, 0)], [(0, 1, 2)])
+    assert SurfaceDistance(mesh.vertices, mesh.faces).tree.n < CANDIDATES[0]
     assert score(
         rectangle((0, 0), (1e-3, 1e-3), 0), rectangle((0, 0), (1e-3, 1e-3), 1e-3)
     ).accuracy_cm == pytest.approx(0.1)
@@ -275,7 +275,7 @@ def test_a_slanted_surface_is_seen_between_the_pixel_centres():
     plane = mesh_of(
         [(x, y, 2 + slope * x) for x in (-0.5, 0.3) for y in (-1, 1)], [(0, 1, 2), (1, 3, 2)]
     )
-    points = sample_surface(plane, 2000, np.random.default_rng(0))
+    points = sample_surface(plane.vertices, plane.faces, 2000, np.random.default_rng(0))
     (seen,) = points_within_view(VIEWS, plane, (points,), (0.005,))
     x, y, z = points.T
     within = (
@@ -328,7 +328,10 @@ def test_views_agree_with_open3d_in_a_furnished_room():
     mesh, pose, camera = room.ground_truth_mesh(), room.T_world_camera[3], room.camera
     rng = np.random.default_rng(0)
     points = np.concatenate(
-        [sample_surface(mesh, 20_000, rng), rng.uniform((-2, -1.5, 0), (2, 1.5, 2.5), (20_000, 3))]
+        [
+            sample_surface(mesh.vertices, mesh.faces, 20_000, rng),
+            rng.uniform((-2, -1.5, 0), (2, 1.5, 2.5), (20_000, 3)),
+        ]
     )
     (seen,) = points_within_view(Views(camera, pose[None], 0.3, 4.0), mesh, (points,), (0.005,))
     toward = points - pose[:3, 3]

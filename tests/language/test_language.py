@@ -14,6 +14,7 @@ import pytest
 
 from taichi_unifusion import Frame, Mesh, PinholeCamera
 from taichi_unifusion.errors import FileError, FrameError, InputError
+from taichi_unifusion.geometry.triangles import vertex_areas
 from taichi_unifusion.language import (
     feature_image,
     folder,
@@ -23,7 +24,7 @@ from taichi_unifusion.language import (
 )
 from taichi_unifusion.language.embeddings import TextEmbeddings, read_embeddings
 from taichi_unifusion.language.prompts import competitors, embed, relevance
-from taichi_unifusion.language.regions import find_regions, vertex_areas
+from taichi_unifusion.language.regions import find_regions
 from taichi_unifusion.networks.tokenizer import ClipTokenizer
 
 HALF = 1e-3  # half precision of stored features
@@ -238,7 +239,7 @@ def test_regions_are_parts_with_their_boxes_best_first():
 
 def test_areas_add_up_and_wrong_arguments_are_said():
     mesh = sheets(0, 5)
-    assert abs(vertex_areas(mesh).sum() - 2) < EXACT
+    assert abs(vertex_areas(mesh.vertices, mesh.faces).sum() - 2) < EXACT
     for relevance_, threshold in ((np.zeros(7), 0.5), (np.zeros(200), 1.0)):
         with pytest.raises(InputError):
             find_regions(mesh, relevance_, threshold=threshold)
