@@ -24,9 +24,9 @@ from quality_methods import PAPER
 from quality_scenes import DEPTH_RANGE, SCENES, Scene
 
 import taichi_unifusion as uf
-from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
+from taichi_unifusion.evaluation import Viewpoints, evaluate_rendering, evaluate_surface
 from taichi_unifusion.maps.encoding import EncoderSettings, PositionEncoding
-from taichi_unifusion.rendering.preview import View, render_mesh
+from taichi_unifusion.rendering.preview import Viewpoint, render_mesh
 from taichi_unifusion.types import Mesh
 
 VOXEL_SIZES = (0.02, 0.03, 0.05, 0.07, 0.10)  # [m]
@@ -60,7 +60,7 @@ def row(name: str, mesh: Mesh, megabytes: float, milliseconds: float, scene: Sce
     seen = evaluate_rendering(mesh, scene.held_out, depth_min=near, depth_max=far)
     shares = ["-"] * 4
     if scene.ground_truth is not None:
-        views = Views(scene.frames[0].camera, scene.T_world_camera, near, far)
+        views = Viewpoints(scene.frames[0].camera, scene.T_world_camera, near, far)
         surface = evaluate_surface(mesh, scene.ground_truth, views=views)
         wide, strict = surface.scores
         shares = [f"{100 * x:.1f}" for x in (wide.precision, wide.recall, wide.f1, strict.f1)]
@@ -85,7 +85,7 @@ def shaded(mesh: Mesh, scene: Scene, title: str) -> NDArray[np.uint8]:
     """The mesh without its colour from a held-out camera, BGR."""
     frame = scene.held_out[len(scene.held_out) // 3]
     camera = frame.camera.resized(480, 480 * frame.camera.height // frame.camera.width)
-    image = render_mesh(replace(mesh, attributes={}), View(camera, frame.T_world_camera))[
+    image = render_mesh(replace(mesh, attributes={}), Viewpoint(camera, frame.T_world_camera))[
         ..., ::-1
     ].copy()
     return cv2.putText(

@@ -27,7 +27,7 @@ from quality_scenes import DEPTH_RANGE, SCENES, Scene
 
 import taichi_unifusion as uf
 from taichi_unifusion.errors import UniFusionError
-from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
+from taichi_unifusion.evaluation import Viewpoints, evaluate_rendering, evaluate_surface
 from taichi_unifusion.evaluation.rendering import FrameScore
 from taichi_unifusion.files.atomic import check_writable
 from taichi_unifusion.types import Frame
@@ -76,7 +76,7 @@ def measure(
     )
     numbers.update({name: value for name, value in asdict(rendering).items() if name != "frames"})
     if scene.ground_truth is not None:
-        views = Views(scene.frames[0].camera, scene.T_world_camera, near, far)
+        views = Viewpoints(scene.frames[0].camera, scene.T_world_camera, near, far)
         surface = evaluate_surface(reconstruction.mesh, scene.ground_truth, views=views)
         numbers.update({name: value for name, value in asdict(surface).items() if name != "scores"})
         for score in surface.scores:

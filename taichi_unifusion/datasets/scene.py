@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..errors import DatasetError, InputError
 from ..files.trajectories import read_trajectory
-from ..rendering.textured_scene import TexturedScene, View, load_scene
+from ..rendering.textured_scene import SceneImages, TexturedScene, load_scene
 from ..types import Frame, Mesh, PinholeCamera, Trajectory
 from .base import Dataset
 from .synthetic import FOCAL_PER_WIDTH
@@ -78,7 +78,7 @@ class SceneDataset(Dataset):
             f"{self.name} frame {index}",
         )
 
-    def view(self, index: int) -> View:
+    def view(self, index: int) -> SceneImages:
         """Exact depth, colour, object and incidence of every pixel of frame `index`."""
         return self.scene.render(self.camera, self.T_world_camera[index])
 
@@ -127,7 +127,9 @@ def kinect_camera(width: int = 640, height: int = 480) -> PinholeCamera:
     return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def kinect_reading(view: View, camera: PinholeCamera, seed: int, frame: int) -> NDArray[np.float32]:
+def kinect_reading(
+    view: SceneImages, camera: PinholeCamera, seed: int, frame: int
+) -> NDArray[np.float32]:
     """What a Kinect v1 would read there, (H, W) [m], 0 where it has no reading; depends on seed,
     frame and pixel alone.
     """

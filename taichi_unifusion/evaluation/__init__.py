@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from .segmentation import SegmentationResult, evaluate_segmentation, transfer_labels
     from .surface import SurfaceResult, evaluate_surface
     from .trajectory import TrajectoryResult, evaluate_trajectory
-    from .visibility import Views
+    from .viewpoints import Viewpoints
 
 __all__ = [
     "SurfaceResult",
     "evaluate_surface",
-    "Views",
+    "Viewpoints",
     "RenderingResult",
     "evaluate_rendering",
     "TrajectoryResult",
@@ -32,7 +32,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "surface": ["SurfaceResult", "evaluate_surface"],
-        "visibility": ["Views"],
+        "viewpoints": ["Viewpoints"],
         "rendering": ["RenderingResult", "evaluate_rendering"],
         "trajectory": ["TrajectoryResult", "evaluate_trajectory"],
         "segmentation": ["SegmentationResult", "evaluate_segmentation", "transfer_labels"],

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..geometry.triangles import SurfaceDistance, sample_surface
 from ..rendering.mesh_checks import check_mesh
 from ..types import Mesh
-from .visibility import Views, points_within_view
+from .viewpoints import Viewpoints, points_within_view
 
 SAMPLES = 100_000
 THRESHOLDS = (0.025, 0.01)  # [m] the paper's, and one that a 5 cm voxel has to earn
@@ -55,7 +55,7 @@ def evaluate_surface(
     reconstruction: Mesh,
     ground_truth: Mesh,
     *,
-    views: Views | None = None,
+    views: Viewpoints | None = None,
     thresholds: Sequence[float] = THRESHOLDS,
     samples: int = SAMPLES,
     seed: int = 0,

@@ -8,15 +8,22 @@ these. Your own is any object with `name`, and `image_features(frame) -> (h, w, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from ..errors import InputError, check_choice
+from ..networks.encoders import ImageEncoder, TextEncoder, feature_image, unit_length
 
-from ..errors import FrameError, InputError, check_choice
-from ..types import Frame
+__all__ = [
+    "IMAGE_ENCODERS",
+    "TEXT_ENCODERS",
+    "ImageEncoder",
+    "TextEncoder",
+    "feature_image",
+    "make_image_encoder",
+    "make_text_encoder",
+    "unit_length",
+]
 
 IMAGE_ENCODERS = {  # name -> module, its function, what stands after the colon
     "clip": (
@@ -42,24 +49,6 @@ TEXT_ENCODERS = {
 }
 
 
-class ImageEncoder(Protocol):
-    """f_im of Fig. 6 (c): features of a frame's image."""
-
-    name: str
-
-    def image_features(self, frame: Frame) -> NDArray[np.float32]:
-        """(h, w, c) at any resolution, unit length; raises FrameError where the frame has none."""
-
-
-class TextEncoder(Protocol):
-    """f_text of Fig. 6 (c)."""
-
-    name: str
-
-    def text_features(self, texts: Sequence[str]) -> NDArray[np.float32]:
-        """(n, c), unit length; raises InputError for a text that it has no vector for."""
-
-
 def make_image_encoder(text: str, **options: Any) -> ImageEncoder:
     """The image encoder that `NAME:WHERE` names; raises InputError for an unknown name."""
     return _make(text, IMAGE_ENCODERS, "features", options)
@@ -81,26 +70,3 @@ def _make(
             f"{what}: '{name}' needs more, as in {name}:{after.split(':')[0]} ({after})"
         )
     return getattr(import_module(module, __package__), function)(where, **options)
-
-
-def feature_image(encoder: ImageEncoder, frame: Frame) -> NDArray[np.float32]:
-    """An encoder's features (h, w, c) of a frame at unit length; FrameError where none is finite,
-    InputError for another shape."""
-    values = np.asarray(encoder.image_features(frame))
-    if values.ndim != 3 or values.dtype.kind != "f" or not values.size:
-        raise InputError(
-            f"{encoder.name}: gives {values.shape} {values.dtype}, not features (h, w, c)"
-        )
-    values = unit_length(values)
-    if not np.isfinite(values).any():
-        raise FrameError(
-            f"{encoder.name}: not one feature of frame {frame.name or frame.index} is finite"
-        )
-    return values
-
-
-def unit_length(vectors: NDArray) -> NDArray[np.float32]:
-    """Vectors (..., c) at unit length; a zero or not finite one becomes NaN."""
-    vectors = np.asarray(vectors, np.float32)
-    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(lengths > 0, vectors / np.where(lengths > 0, lengths, 1), np.float32(np.nan))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
 from ..files.atomic import read_bytes
-from . import unit_length
+from ..networks.encoders import unit_length
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
+from ..networks.encoders import unit_length
 from ..types import Frame
-from . import unit_length
 
 SUFFIXES = (".npy", ".npz", ".pt")
 LONGEST_SIDE = 96  # pixels of a feature image; more only repeats what the networks made

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from . import TextEncoder, unit_length
+from ..networks.encoders import TextEncoder, unit_length
 from .embeddings import TextEmbeddings
 
 TEMPLATES = (

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..maps import LatentMap
+from ..networks.encoders import TextEncoder
 from ..types import Mesh
-from . import TextEncoder
 from .prompts import LOGIT_SCALE, TEMPLATES, competitors, embed, relevance
 from .regions import MIN_AREA, THRESHOLD, Region, find_regions
 

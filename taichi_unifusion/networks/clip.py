@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
-from ..language import unit_length
 from ..types import Frame
+from .encoders import unit_length
 
 NORMALIZATION = {  # model type -> mean and standard deviation of the training images, where the folder does not say
     "clip": ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)),

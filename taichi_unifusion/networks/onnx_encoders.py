@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError, InputError
-from ..language import unit_length
 from ..types import Frame
 from .clip import NORMALIZATION, SHORT_SIDE
+from .encoders import unit_length
 from .onnx_session import open_session, run_session
 from .tokenizer import ClipTokenizer
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import lazy_loader
 
 if TYPE_CHECKING:
-    from .base import Look, SurfaceProperty
+    from ..rendering.look import Look
+    from .base import SurfaceProperty
     from .specification import make_property
 
 # name -> method -> module here, what makes it; the first is the default
@@ -28,8 +29,8 @@ PROPERTIES: dict[str, dict[str, tuple[str, str]]] = {
         "onnx": ("style", "network_style"),
     },
     "images": {"folder": ("images", "folder_images")},
-    "normal": {"depth": ("geometry", "surface_normal")},
-    "curvature": {"depth": ("geometry", "mean_curvature")},
+    "normal": {"depth": ("shape", "surface_normal")},
+    "curvature": {"depth": ("shape", "mean_curvature")},
 }
 
 __all__ = ["PROPERTIES", "Look", "SurfaceProperty", "make_property"]

@@ -1,6 +1,4 @@
-"""What a property of the surface is: the paper's f_im, a function of a frame, and how its values
-are shown (Fig. 6).
-"""
+"""What a property of the surface is: the paper's f_im, a function of a frame (Fig. 6)."""
 
 from __future__ import annotations
 
@@ -13,26 +11,11 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError, InputError, UniFusionError
 from ..maps.settings import PropertySettings
-from ..rendering.colormaps import check_colormap
+from ..rendering.look import Look
 from ..types import Frame
 
 # files and attributes of every results folder
 RESERVED = ("surface", "color", "mesh", "preview", "normals", "features")
-
-
-@dataclass(frozen=True)
-class Look:
-    """How values become colours."""
-
-    colormap: str = "viridis"  # one of COLORMAPS; ignored for three channels, which are RGB
-    # values of its two ends; None: where most values of a mesh lie
-    range: tuple[float, float] | None = (0.0, 1.0)
-    label: str = ""  # what the values are, with their unit, for the legend
-
-    def __post_init__(self) -> None:
-        check_colormap(self.colormap)
-        if self.range is not None and not self.range[0] < self.range[1]:
-            raise InputError(f"range: must rise, got {self.range}")
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ..datasets.listing import list_names
 from ..errors import FrameError, InputError
 from ..files.images import read_values
+from ..rendering.look import Look
 from ..types import Frame
-from .base import Look, SurfaceProperty
+from .base import SurfaceProperty
 
 SUFFIXES = (".npy", ".png", ".jpg", ".jpeg")
 NUMBERS = re.compile(r"\d+")

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError, InputError
+from ..rendering.look import Look
 from ..types import Frame
-from .base import Look, SurfaceProperty
+from .base import SurfaceProperty
 
 FULL_SCALE = 65535.0  # what data sets scale infrared to
 KNEE = 100.0  # units up to which the logarithmic curve is nearly straight: about a sensor's noise

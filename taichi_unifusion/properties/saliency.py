@@ -17,8 +17,9 @@ from ..networks.image_network import (
     check_preparation,
     prepare,
 )
+from ..rendering.look import Look
 from ..types import Frame
-from .base import Look, SurfaceProperty, color_of
+from .base import SurfaceProperty, color_of
 
 LOOK = Look("viridis", (0.0, 1.0), "saliency")
 PICTURE = 96  # pixels of the longer side: coarse, so that objects count and not their texture

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..networks.image_network import ImageNetwork, check_preparation, prepare
+from ..rendering.look import Look
 from ..types import Frame
-from .base import Look, SurfaceProperty, color_of
+from .base import SurfaceProperty, color_of
 
 LOOK = Look()
 CONTOUR_WIDTH = 2.0  # [pixels]

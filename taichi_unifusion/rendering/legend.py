@@ -8,25 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..properties.base import Look
 from ..types import Mesh
-from .colormaps import color_table, colorize
+from .look import Look, color_table, colorize, shown_range
 
-# percentiles of the values that a colour map covers where a property states no range
-MOST = (1.0, 99.0)
 HEIGHT = 88  # pixels of a legend
 INK, PAPER = (40, 40, 40), 255
-
-
-def shown_range(values: NDArray, look: Look) -> tuple[float, float]:
-    """The values (N, c) at the two ends of the colour map; around 0 for the diverging one."""
-    if look.range is not None:
-        return look.range
-    finite = values[np.isfinite(values)]
-    low, high = (float(end) for end in np.percentile(finite, MOST)) if len(finite) else (0.0, 1.0)
-    if look.colormap == "diverging":
-        low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
-    return (low, high) if high - low > 1e-6 * max(abs(low), abs(high)) else (low - 0.5, low + 0.5)
 
 
 def property_mesh(mesh: Mesh, name: str, look: Look) -> Mesh:

@@ -47,7 +47,7 @@ STRAY = 0.002
 
 
 @dataclass(frozen=True)
-class View:
+class Viewpoint:
     """A camera that looks at a mesh; nothing nearer than `near` [m] is drawn."""
 
     camera: PinholeCamera
@@ -104,7 +104,7 @@ def draw_preview(
     return np.hstack(panels[1:])
 
 
-def render_mesh(mesh: Mesh, view: View) -> NDArray[np.uint8]:
+def render_mesh(mesh: Mesh, view: Viewpoint) -> NDArray[np.uint8]:
     """Picture (H, W, 3) RGB of the sides of `mesh` that face the camera; InputError for a mesh
     without a finite triangle.
     """
@@ -160,7 +160,7 @@ def _drawable(mesh: Mesh) -> _Drawable:
     )
 
 
-def _draw(drawable: _Drawable, view: View) -> NDArray[np.uint8]:
+def _draw(drawable: _Drawable, view: Viewpoint) -> NDArray[np.uint8]:
     camera = view.camera.resized(view.camera.width * SAMPLES, view.camera.height * SAMPLES)
     nearest, projection = _rasterize(drawable, camera, view.T_world_camera, view.near)
     import taichi as ti
@@ -224,7 +224,7 @@ class _Surface:
 
 def _choose_views(
     drawable: _Drawable, trajectory: Trajectory | None, names: Sequence[str], size: tuple[int, int]
-) -> list[View]:
+) -> list[Viewpoint]:
     surface = _sample_surface(drawable)
     matrices = () if trajectory is None else trajectory.T_world_camera
     poses = [check_rigid(T, f"preview: pose {i}") for i, T in enumerate(matrices)]
@@ -296,10 +296,10 @@ def _pinhole(size: tuple[int, int], fov: float) -> PinholeCamera:
     return PinholeCamera(width, height, focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
 
 
-def _view(R_world_camera: NDArray, eye: NDArray, camera: PinholeCamera, near: float) -> View:
+def _view(R_world_camera: NDArray, eye: NDArray, camera: PinholeCamera, near: float) -> Viewpoint:
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3], T_world_camera[:3, 3] = R_world_camera, eye
-    return View(camera, T_world_camera, near)
+    return Viewpoint(camera, T_world_camera, near)
 
 
 def _fitted_eye(
@@ -317,7 +317,9 @@ def _fitted_eye(
     return R @ np.array([*(high + low) / 2, ((low - high) / (2 * tangents)).min()])
 
 
-def _overview(surface: _Surface, direction: NDArray, up: NDArray, size: tuple[int, int]) -> View:
+def _overview(
+    surface: _Surface, direction: NDArray, up: NDArray, size: tuple[int, int]
+) -> Viewpoint:
     """The view from `direction` that the surface seen from there just fills."""
     R = _rotation_looking(-direction, up)
     camera = _pinhole(size, OVERVIEW_FOV)
@@ -329,7 +331,9 @@ def _overview(surface: _Surface, direction: NDArray, up: NDArray, size: tuple[in
     return _view(R, eye, camera, max(1e-3 * depth.max(), 0.2 * depth.min()))
 
 
-def _camera_view(drawable: _Drawable, poses: NDArray, up: NDArray, size: tuple[int, int]) -> View:
+def _camera_view(
+    drawable: _Drawable, poses: NDArray, up: NDArray, size: tuple[int, int]
+) -> Viewpoint:
     """The view of the recorded camera that sees most, levelled and drawn back; what it left behind
     stays cut away.
     """
@@ -357,6 +361,8 @@ def _seen_depth(drawable: _Drawable, T_world_camera: NDArray) -> NDArray[np.floa
     """A small depth image [m] of the mesh from a recorded camera, 0 where there is none or its back
     is seen.
     """
-    nearest, _ = _rasterize(drawable, _pinhole(THUMBNAIL, JUDGED_FOV), T_world_camera, View.near)
+    nearest, _ = _rasterize(
+        drawable, _pinhole(THUMBNAIL, JUDGED_FOV), T_world_camera, Viewpoint.near
+    )
     depth = (nearest >> 32).astype(np.int32).view(np.float32)
     return np.where(nearest == np.iinfo(np.int64).max, np.float32(0), depth)

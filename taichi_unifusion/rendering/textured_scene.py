@@ -31,7 +31,7 @@ MAX_TEXELS = 2**31 // 3  # an array of Taichi holds at most 2^31 - 1 numbers
 
 
 @dataclass(frozen=True)
-class View:
+class SceneImages:
     """What a camera sees at the pixels' centres; colour is the mean over the pixel."""
 
     depth: NDArray[np.float32]  # (H, W) [m], 0 where nothing is hit
@@ -59,7 +59,7 @@ class TexturedScene:
         """The exact surface, hidden parts included."""
         return Mesh(self.vertices, self.faces)
 
-    def render(self, camera: PinholeCamera, T_world_camera: NDArray) -> View:
+    def render(self, camera: PinholeCamera, T_world_camera: NDArray) -> SceneImages:
         """Depth, colour and objects that `camera` sees from T_world_camera; PoseError if that is no
         rigid transform.
         """
@@ -87,7 +87,7 @@ class TexturedScene:
             nearest,
             color,
         )
-        return View(color=color, **self._surfaces(camera, T_world_camera))
+        return SceneImages(color=color, **self._surfaces(camera, T_world_camera))
 
     def render_depth(self, camera: PinholeCamera, T_world_camera: NDArray) -> NDArray[np.float32]:
         """Depth (H, W) [m] alone, 0 where nothing is hit."""

@@ -18,7 +18,7 @@ from ..config import Config, load_config
 from ..datasets import Dataset, open_dataset
 from ..errors import DatasetError, FileError, FrameError
 from ..evaluation.trajectory import align_poses, match_poses
-from ..evaluation.visibility import Views
+from ..evaluation.viewpoints import Viewpoints
 from ..files.atomic import read_bytes
 from ..files.meshes import read_mesh
 from ..files.trajectories import read_trajectory
@@ -106,11 +106,11 @@ class Run:
         )
         return T
 
-    def views(self) -> Views:
+    def views(self) -> Viewpoints:
         """Where its cameras looked from, in the recording's world, within the depth that it used."""
         limits = self.config().preprocess
         camera = self.recording()[self.used[0]].camera
-        return Views(
+        return Viewpoints(
             camera,
             self.T_recording_run() @ self.trajectory().T_world_camera,
             limits.depth_min,

@@ -26,8 +26,8 @@ from ..files.atomic import check_writable, write_text
 from ..files.meshes import write_mesh
 from ..files.trajectories import write_trajectory
 from ..pipeline import FEATURES, Pipeline
-from ..properties.base import Look
-from ..rendering.legend import draw_legend, property_mesh, shown_range
+from ..rendering.legend import draw_legend, property_mesh
+from ..rendering.look import Look, shown_range
 from ..rendering.preview import draw_preview, render_preview, write_png
 from ..run_log import RunResult, StepResult
 from ..types import Mesh, Trajectory

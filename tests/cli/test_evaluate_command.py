@@ -16,7 +16,7 @@ from tiny_recording import FLAGS, make_frames, write_folder
 from taichi_unifusion import Trajectory, load_map, open_dataset
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.errors import FileError
-from taichi_unifusion.evaluation import Views, evaluate_rendering, evaluate_surface
+from taichi_unifusion.evaluation import Viewpoints, evaluate_rendering, evaluate_surface
 from taichi_unifusion.files.foreign_meshes import read_any_mesh
 from taichi_unifusion.files.meshes import read_mesh
 from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
@@ -161,7 +161,7 @@ def test_surface_of_a_results_folder_is_judged_by_what_its_frames_saw(results, t
     run = read_run(results)
     limits = run.config().preprocess
     camera = make_frames(1)[0].camera
-    views = Views(camera, run.trajectory().T_world_camera, limits.depth_min, limits.depth_max)
+    views = Viewpoints(camera, run.trajectory().T_world_camera, limits.depth_min, limits.depth_max)
     known = evaluate_surface(run.mesh(), read_mesh(truth), views=views, samples=int(SAMPLES))
     assert found["accuracy_cm"] == pytest.approx(known.accuracy_cm, rel=SAME)
     assert [s["f1"] for s in found["scores"]] == pytest.approx(

@@ -22,8 +22,8 @@ from meshes import (
 
 from taichi_unifusion import PinholeCamera, open_dataset
 from taichi_unifusion.errors import InputError, PoseError
-from taichi_unifusion.evaluation import Views, evaluate_surface
-from taichi_unifusion.evaluation.visibility import points_within_view
+from taichi_unifusion.evaluation import Viewpoints, evaluate_surface
+from taichi_unifusion.evaluation.viewpoints import points_within_view
 from taichi_unifusion.geometry.triangles import (
     CANDIDATES,
     EXACT_M,
@@ -234,10 +234,10 @@ def test_published_protocol_agrees_with_open3d():
 # z = 1.
 WALL, BOX = rectangle((-2, -2), (2, 2), 2.0), box((-0.2, -0.2, 1.0), (0.2, 0.2, 1.4))
 SCENE = joined(WALL, BOX)
-VIEWS = Views(CAMERA, at(0, 0, 0)[None], 0.3, 3.0)
+VIEWS = Viewpoints(CAMERA, at(0, 0, 0)[None], 0.3, 3.0)
 
 
-def in_view(points, behind: float = 0.0, views: Views = VIEWS) -> list[bool]:
+def in_view(points, behind: float = 0.0, views: Viewpoints = VIEWS) -> list[bool]:
     return points_within_view(views, SCENE, (np.array(points, float),), (behind,))[0].tolist()
 
 
@@ -251,18 +251,20 @@ def test_what_a_camera_sees():
     assert in_view([(0, 0, 1.05), (0.6, 0, 2.05)], behind=0.1) == [True] * 2
     assert in_view([(0, 0, 1.15), (0.6, 0, 2.15)], behind=0.1) == [False] * 2
     assert (
-        in_view([(0, 0, 0.25), (0.6, 0, 2)], views=Views(CAMERA, VIEWS.T_world_camera, 0.3, 1.9))
+        in_view(
+            [(0, 0, 0.25), (0.6, 0, 2)], views=Viewpoints(CAMERA, VIEWS.T_world_camera, 0.3, 1.9)
+        )
         == [False] * 2
     )
 
 
 def test_one_camera_that_sees_is_enough():
-    both = Views(CAMERA, np.stack([at(0, 0, 0), at(0.5, 0, 0)]), 0.3, 3.0)
+    both = Viewpoints(CAMERA, np.stack([at(0, 0, 0), at(0.5, 0, 0)]), 0.3, 3.0)
     assert in_view([(0.3, 0, 2), (0, 0, 1)], views=both) == [True, True]
 
 
 def test_where_rays_hit_nothing_space_is_free():
-    alone = Views(CAMERA, at(0, 0, 0)[None], 0.3, 3.0)
+    alone = Viewpoints(CAMERA, at(0, 0, 0)[None], 0.3, 3.0)
     (seen,) = points_within_view(alone, BOX, (np.array([[0.6, 0, 2.0], [0.6, 0, 3.5]]),), (0.1,))
     assert seen.tolist() == [True, False]
 
@@ -333,7 +335,9 @@ def test_views_agree_with_open3d_in_a_furnished_room():
             rng.uniform((-2, -1.5, 0), (2, 1.5, 2.5), (20_000, 3)),
         ]
     )
-    (seen,) = points_within_view(Views(camera, pose[None], 0.3, 4.0), mesh, (points,), (0.005,))
+    (seen,) = points_within_view(
+        Viewpoints(camera, pose[None], 0.3, 4.0), mesh, (points,), (0.005,)
+    )
     toward = points - pose[:3, 3]
     rays = np.hstack([np.broadcast_to(pose[:3, 3], toward.shape), toward]).astype(np.float32)
     # in shares of the way
@@ -376,7 +380,7 @@ EMPTY = mesh_of([], [])
         ((WALL, WALL), {"distance_to": "vertices"}, "choose surface or samples"),
         (
             (WALL, WALL),
-            {"views": Views(CAMERA, at(0, 0, 5)[None])},
+            {"views": Viewpoints(CAMERA, at(0, 0, 5)[None])},
             "see nothing of the ground truth",
         ),
         (
@@ -408,7 +412,7 @@ def test_bad_meshes_are_told_in_one_sentence(meshes, options, told):
 )
 def test_bad_views_are_told_in_one_sentence(poses, options, error, told):
     with pytest.raises(error, match=told):
-        Views(PinholeCamera(64, 48, 40, 40, 32, 24), poses, **options)
+        Viewpoints(PinholeCamera(64, 48, 40, 40, 32, 24), poses, **options)
 
 
 def test_results_are_values():

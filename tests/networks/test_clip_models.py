@@ -16,8 +16,6 @@ transformers = pytest.importorskip(
 
 from taichi_unifusion import Frame, PinholeCamera  # noqa: E402
 from taichi_unifusion.errors import FileError, FrameError, InputError  # noqa: E402
-
-# noqa: E402
 from taichi_unifusion.language import feature_image, make_image_encoder, make_text_encoder
 from taichi_unifusion.language.prompts import embed  # noqa: E402
 from taichi_unifusion.networks import clip

@@ -16,8 +16,8 @@ from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.errors import FrameError, InputError
 from taichi_unifusion.maps.settings import PropertySettings
 from taichi_unifusion.properties import PROPERTIES, Look, SurfaceProperty, make_property
-from taichi_unifusion.rendering.colormaps import COLORMAPS, color_table, colorize
-from taichi_unifusion.rendering.legend import HEIGHT, draw_legend, property_mesh, shown_range
+from taichi_unifusion.rendering.legend import HEIGHT, draw_legend, property_mesh
+from taichi_unifusion.rendering.look import COLORMAPS, color_table, colorize, shown_range
 from taichi_unifusion.types import Mesh
 
 CAMERA = PinholeCamera(120, 90, 100.0, 100.0, 59.5, 44.5)

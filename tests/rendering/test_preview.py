@@ -10,7 +10,7 @@ import pytest
 
 from taichi_unifusion import runtime
 from taichi_unifusion.errors import InputError, PoseError
-from taichi_unifusion.rendering.preview import View, render_mesh, render_preview
+from taichi_unifusion.rendering.preview import Viewpoint, render_mesh, render_preview
 from taichi_unifusion.types import Mesh, PinholeCamera, Trajectory
 
 cv2 = pytest.importorskip("cv2")
@@ -205,7 +205,7 @@ def test_rasterize_does_not_depend_on_order():
 
 
 def test_N5_same_mesh_gives_the_same_bytes():
-    view = View(CAMERA, looking((0.3, 0.2, 1.0), (2, 1, 0.5)))
+    view = Viewpoint(CAMERA, looking((0.3, 0.2, 1.0), (2, 1, 0.5)))
     assert np.array_equal(render_mesh(room(), view), render_mesh(room(), view))
 
 
@@ -217,12 +217,12 @@ def test_N5_same_mesh_gives_the_same_bytes():
     [((2, 0, 1), RED), ((-2, 0, 1), GREEN), ((0, 1.5, 1), BLUE), ((0, -1.5, 1), YELLOW)],
 )
 def test_walls_have_their_colors(target, color):
-    image = render_mesh(room(), View(CAMERA, looking((0, 0, 1), target)))
+    image = render_mesh(room(), Viewpoint(CAMERA, looking((0, 0, 1), target)))
     assert is_like(image[24, 32], color)
 
 
 def test_up_is_up_and_right_is_right():
-    image = render_mesh(room(), View(CAMERA, looking((-1.5, 0, 1), (2, 0, 1))))
+    image = render_mesh(room(), Viewpoint(CAMERA, looking((-1.5, 0, 1), (2, 0, 1))))
     assert is_like(image[2, 32], CYAN) and is_like(image[-3, 32], WHITE)
     # y is left when one looks along x with z up
     assert is_like(image[24, 2], BLUE) and is_like(image[24, -3], YELLOW)
@@ -231,14 +231,14 @@ def test_up_is_up_and_right_is_right():
 def test_near_things_hide_far_ones():
     box = quad([(1, -0.2, 0.8), (1, -0.2, 1.2), (1, 0.2, 1.2), (1, 0.2, 0.8)], BLUE)
     for mesh in (join(room(), box), join(box, room())):
-        image = render_mesh(mesh, View(CAMERA, looking((0, 0, 1), (2, 0, 1))))
+        image = render_mesh(mesh, Viewpoint(CAMERA, looking((0, 0, 1), (2, 0, 1))))
         assert is_like(image[24, 32], BLUE) and is_like(image[24, 50], RED)
-        beyond = render_mesh(mesh, View(CAMERA, looking((0, 0, 1), (2, 0, 1)), near=1.5))
+        beyond = render_mesh(mesh, Viewpoint(CAMERA, looking((0, 0, 1), (2, 0, 1)), near=1.5))
         assert is_like(beyond[24, 32], RED)
 
 
 def test_backs_are_not_drawn():
-    outside = render_mesh(room(), View(CAMERA, looking((5, 0, 5), (0, 0, 0.5))))
+    outside = render_mesh(room(), Viewpoint(CAMERA, looking((5, 0, 5), (0, 0, 0.5))))
     assert is_like(outside[24, 32], WHITE)  # the floor, through the ceiling and the red wall
     assert (
         share_of(outside, RED) == 0
@@ -253,7 +253,7 @@ def test_colors_are_interpolated_in_perspective():
     mesh = mesh.with_attribute(
         "color", (mesh.vertices[:, 2:] - 1) / 4 * np.float32([0.5, 0.5, 0.5]) + 0.25
     )
-    image = render_mesh(mesh, View(CAMERA, np.eye(4)))
+    image = render_mesh(mesh, Viewpoint(CAMERA, np.eye(4)))
     rows = np.arange(6, 24)
     y = (rows - CAMERA.cy) / CAMERA.fy
     depth = 3 / (1 - 2 * y)  # of the plane z = 3 + 2 y
@@ -264,8 +264,8 @@ def test_colors_are_interpolated_in_perspective():
 
 
 def test_corners_are_darker_than_open_walls():
-    image = render_mesh(room(), View(CAMERA, looking((0, 0, 1), (2, 0, 1))))
-    at_corner = render_mesh(room(), View(CAMERA, looking((0.8, 0.5, 1), (2, 1.5, 1))))
+    image = render_mesh(room(), Viewpoint(CAMERA, looking((0, 0, 1), (2, 0, 1))))
+    at_corner = render_mesh(room(), Viewpoint(CAMERA, looking((0.8, 0.5, 1), (2, 1.5, 1))))
     column = at_corner[24].astype(int).sum(axis=1)
     assert column[31:34].min() < 0.9 * image[24, 32].astype(int).sum()
 
@@ -273,7 +273,7 @@ def test_corners_are_darker_than_open_walls():
 def test_mesh_without_color_is_grey_and_shaded():
     mesh = room()
     image = render_mesh(
-        Mesh(mesh.vertices, mesh.faces), View(CAMERA, looking((0.3, 0.2, 1.0), (2, 1, 0.5)))
+        Mesh(mesh.vertices, mesh.faces), Viewpoint(CAMERA, looking((0.3, 0.2, 1.0), (2, 1, 0.5)))
     ).astype(int)
     assert np.ptp(image, axis=2).max() <= LEVELS and np.ptp(image[..., 0]) > 30
 
@@ -281,7 +281,7 @@ def test_mesh_without_color_is_grey_and_shaded():
 def test_given_normals_equal_computed_ones_on_a_plane():
     wall = quad([(2, -2, 0), (2, -2, 2), (2, 2, 2), (2, 2, 0)], RED, 3)
     normals = np.tile(np.float32([-1, 0, 0]), (len(wall.vertices), 1))
-    view = View(CAMERA, looking((0, 0, 1), (2, 0, 1)))
+    view = Viewpoint(CAMERA, looking((0, 0, 1), (2, 0, 1)))
     a, b = (
         render_mesh(wall, view),
         render_mesh(Mesh(wall.vertices, wall.faces, normals, wall.attributes), view),
@@ -299,7 +299,7 @@ def test_nan_is_left_out():
     )
     vertices[wall[12]] = np.nan  # the middle of the red wall
     color[wall[0]] = np.nan
-    view = View(CAMERA, looking((0, 0, 1), (2, 0, 1)))
+    view = Viewpoint(CAMERA, looking((0, 0, 1), (2, 0, 1)))
     image = render_mesh(Mesh(vertices, mesh.faces, None, {"color": color}), view)
     assert image[24, 32].min() > 240 and is_like(image[24, 50], RED)  # a hole, the rest as before
 

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError, InputError
 from ..preprocessing import PreprocessSettings, normal_image
+from ..rendering.look import Look
 from ..types import Frame
-from .base import Look, SurfaceProperty
+from .base import SurfaceProperty
 
 # relative depth step between pixels beyond which they lie on different surfaces
 FARTHEST_JUMP = 0.03

@@ -18,7 +18,7 @@ STEEPEST = 8.0
 
 
 @dataclass(frozen=True)
-class Views:
+class Viewpoints:
     """Where a camera with a limited range looked from."""
 
     camera: PinholeCamera
@@ -41,7 +41,7 @@ class Views:
 
 
 def points_within_view(
-    views: Views,
+    views: Viewpoints,
     mesh: Mesh,
     points: tuple[NDArray, ...],
     behind: tuple[float, ...],
@@ -69,7 +69,12 @@ def points_within_view(
 
 
 def _in_view(
-    views: Views, hits: RayHits, corner: NDArray, normals: NDArray, points: NDArray, slack: float
+    views: Viewpoints,
+    hits: RayHits,
+    corner: NDArray,
+    normals: NDArray,
+    points: NDArray,
+    slack: float,
 ) -> NDArray[np.bool_]:
     """Which points (N, 3) world [m] one camera has in view; `corner` and `normals` are the planes
     of the triangles.

@@ -1,14 +1,17 @@
-"""Colour maps in which equal steps of value look like equal steps of colour."""
+"""How values become colours: colour maps in which equal steps of value look like equal steps of
+colour, and the range of values that they cover.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import check_choice
+from ..errors import InputError, check_choice
 
 COLORMAPS = {  # name -> OpenCV's number of it; None: made here
     "viridis": cv2.COLORMAP_VIRIDIS,
@@ -21,11 +24,23 @@ COLORMAPS = {  # name -> OpenCV's number of it; None: made here
 }
 # in L*a*b*: equal in lightness, apart in hue
 BLUE, WHITE, RED = (40.0, 10.0, -50.0), (95.0, 0.0, 0.0), (40.0, 60.0, 35.0)
+# percentiles of the values that a colour map covers where a property states no range
+MOST = (1.0, 99.0)
 
 
-def check_colormap(name: str) -> None:
-    """Raise InputError for an unknown colour map."""
-    check_choice("colormap", name, COLORMAPS)
+@dataclass(frozen=True)
+class Look:
+    """How values become colours."""
+
+    colormap: str = "viridis"  # one of COLORMAPS; ignored for three channels, which are RGB
+    # values of its two ends; None: where most values of a mesh lie
+    range: tuple[float, float] | None = (0.0, 1.0)
+    label: str = ""  # what the values are, with their unit, for the legend
+
+    def __post_init__(self) -> None:
+        check_choice("colormap", self.colormap, COLORMAPS)
+        if self.range is not None and not self.range[0] < self.range[1]:
+            raise InputError(f"range: must rise, got {self.range}")
 
 
 @lru_cache
@@ -58,3 +73,14 @@ def colorize(values: NDArray, colormap: str, low: float, high: float) -> NDArray
     return np.stack(
         [np.interp(place, np.arange(256), table[:, k]) for k in range(3)], axis=1
     ).astype(np.float32)
+
+
+def shown_range(values: NDArray, look: Look) -> tuple[float, float]:
+    """The values (N, c) at the two ends of the colour map; around 0 for the diverging one."""
+    if look.range is not None:
+        return look.range
+    finite = values[np.isfinite(values)]
+    low, high = (float(end) for end in np.percentile(finite, MOST)) if len(finite) else (0.0, 1.0)
+    if look.colormap == "diverging":
+        low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
+    return (low, high) if high - low > 1e-6 * max(abs(low), abs(high)) else (low - 0.5, low + 0.5)
