@@ -7,20 +7,15 @@ that it used.
 
 from __future__ import annotations
 
-import difflib
-import reprlib
-import sys
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 import yaml
 
-from .errors import ConfigError, InputError
-from .files.atomic import read_bytes
+from .errors import ConfigError, InputError, convert, did_you_mean, shortened
+from .files.strict_yaml import read_yaml
 from .maps.settings import LatentSettings, PropertySettings, SurfaceSettings
 from .preprocessing import PreprocessSettings
 from .tracking.base import TrackingSettings
@@ -88,38 +83,15 @@ def load_config(path: str | Path, base: Config | None = None) -> Config:
     key or a value of the wrong type or range.
     """
     try:
-        values = yaml.load(read_bytes(path), Loader=_StrictLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "unreadable characters"
-        raise ConfigError(f"{path}{where}: not valid YAML ({problem})") from None
-    except (
-        RecursionError,
-        ValueError,
-    ) as error:  # nested too deep; a date or number that does not exist
-        raise ConfigError(f"{path}: not valid YAML ({error})") from None
+        values = read_yaml(path)
+    except InputError as error:
+        raise ConfigError(str(error)) from None
     return _overlay(base or Config(), values, str(path), "")
 
 
 def dump_config(config: Config) -> str:
     """The whole configuration as YAML that `load_config` reads back."""
     return yaml.safe_dump(_plain(asdict(config)), sort_keys=False, default_flow_style=False)
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """safe_load that refuses a key given twice, where plain YAML would silently keep the last."""
-
-    def construct_mapping(self, node, deep=False):
-        seen = set()
-        for key_node, _ in node.value:
-            key = str(key_node.value)
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key '{key}' is given twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)
 
 
 def _overlay(base: Any, values: Any, source: str, at: str) -> Any:
@@ -130,59 +102,28 @@ def _overlay(base: Any, values: Any, source: str, at: str) -> Any:
         return base
     if not isinstance(values, Mapping):
         raise ConfigError(
-            f"{source}: {at or 'the file'}: expected keys and values, got {reprlib.repr(values)}"
+            f"{source}: {at or 'the file'}: expected keys and values, got {shortened(values)}"
         )
     types, changes = get_type_hints(type(base)), {}
     for key, value in values.items():
         here = f"{at}.{key}" if at else str(key)
         if key not in types:
             raise ConfigError(
-                f"{source}: unknown key '{here[:80]}'{_suggest(str(key), types)}; keys{' there' if at else ''}: "
+                f"{source}: unknown key '{here[:80]}'{did_you_mean(key, types)}; keys{' there' if at else ''}: "
                 f"{', '.join(types)}"
             )
         current = getattr(base, key)
-        changes[key] = (
-            _overlay(current, value, source, here)
-            if is_dataclass(current)
-            else _convert(value, types[key], f"{source}: {here}")
-        )
+        if is_dataclass(current):
+            changes[key] = _overlay(current, value, source, here)
+            continue
+        try:
+            changes[key] = convert(value, types[key], f"{source}: {here}")
+        except InputError as error:
+            raise ConfigError(str(error)) from None
     try:
         return replace(base, **changes)
     except InputError as error:
         raise ConfigError(f"{source}: {f'in {at}: ' if at else ''}{error}") from None
-
-
-def _convert(value: Any, wanted: Any, at: str) -> Any:
-    """`value` as the type `wanted`, or ConfigError."""
-    origin, options = get_origin(wanted), get_args(wanted)
-    if origin is tuple and isinstance(value, list):
-        return tuple(_convert(item, options[0], f"{at}[{i}]") for i, item in enumerate(value))
-    if origin in (Union, UnionType):
-        if value is None and NoneType in options:
-            return None
-        return _convert(value, next(option for option in options if option is not NoneType), at)
-    if origin is Literal:
-        if value in options:
-            return value
-        raise ConfigError(
-            f"{at}: {reprlib.repr(value)} is unknown{_suggest(str(value)[:80], options)}; "
-            f"choose one of {', '.join(options)}"
-        )
-    if wanted is float and isinstance(value, str):  # YAML 1.1 takes 1e-3, without a point, for text
-        with suppress(ValueError):
-            value = float(value)
-    # no NaN, no infinity
-    if wanted is float and type(value) in (int, float) and abs(value) <= sys.float_info.max:
-        return float(value)
-    if type(value) is wanted and wanted is not float:
-        return value
-    kinds = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
-    raise ConfigError(f"{at}: expected {kinds.get(wanted, 'a list')}, got {reprlib.repr(value)}")
-
-
-def _suggest(word: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(word.lower(), list(known), n=1)
-    return f", did you mean '{near[0]}'?" if near else ""
 
 
 def _plain(value: Any) -> Any:

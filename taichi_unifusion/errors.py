@@ -1,12 +1,28 @@
 """What can go wrong, as types: one root, each child also the built-in that callers expect.
 
 A message says what, where and what to do, in one sentence. The command line catches
-`UniFusionError` once and exits 2.
+`UniFusionError` once and exits 2. Below the types: the checks of a caller's words that every room
+needs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import difflib
+import reprlib
+import sys
+from collections.abc import Collection, Iterable
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+_LARGEST_INTEGER = 2**63  # what NumPy and files can hold
+_KINDS = {
+    float: "a number",
+    int: "a whole number",
+    bool: "true or false",
+    str: "text",
+    Path: "a file's name",
+}
 
 
 class UniFusionError(Exception):
@@ -63,7 +79,121 @@ class MissingDependency(UniFusionError, ImportError):
     """An optional package is needed; the message holds the command that installs it."""
 
 
-def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
+def check_choice(name: str, value: object, choices: Collection[str]) -> None:
     """Raise InputError, with the right ones, unless the value of `name` is one of the choices."""
     if value not in choices:
-        raise InputError(f"{name}: '{value}' is unknown, choose one of {', '.join(choices)}")
+        near = did_you_mean(value, choices)
+        shown = f"'{value[:80]}'" if isinstance(value, str) else shortened(value)
+        raise InputError(
+            f"{name}: {shown} is unknown{near}{';' if near else ','} choose one of {', '.join(choices)}"
+        )
+
+
+def did_you_mean(word: object, known: Iterable[str], at_most: int = 1) -> str:
+    """The end of a sentence about an unknown word, ", did you mean 'x' or 'y'?", or nothing if
+    none of the known is like it.
+    """
+    near = difflib.get_close_matches(str(word)[:80].lower(), list(known), n=at_most)
+    names = " or ".join(f"'{name}'" for name in near)
+    return f", did you mean {names}?" if near else ""
+
+
+def convert(value: object, wanted: Any, name: str) -> Any:
+    """`value`, text or what YAML makes of it, as the type `wanted`; InputError calls it `name`.
+
+    Types: float, int, bool, str, Path, Literal, tuple, and unions of them with None. Numbers are
+    finite; a whole number may be written 640.0 or 1e3. Text for a tuple is 320x240 for whole
+    numbers, 0.5/0.25 for others; a list is taken item by item.
+    """
+    if get_origin(wanted) in (Union, UnionType):
+        if value is None and NoneType in get_args(wanted):
+            return None
+        wanted = next(option for option in get_args(wanted) if is_convertible(option))
+    if get_origin(wanted) is Literal:
+        check_choice(name, value, get_args(wanted))
+        return value
+    if get_origin(wanted) is tuple:
+        return _convert_tuple(value, get_args(wanted), name)
+    converted = _CONVERTERS[wanted](value)
+    if converted is None:
+        raise InputError(f"{name}: expected {_KINDS[wanted]}, got {shortened(value)}")
+    return converted
+
+
+def is_convertible(wanted: Any) -> bool:
+    """Whether `convert` can make this type, or one of a union's, from text."""
+    origin = get_origin(wanted)
+    if origin in (Union, UnionType):
+        return any(is_convertible(option) for option in get_args(wanted))
+    return wanted in _CONVERTERS or origin is Literal or origin is tuple
+
+
+def shortened(value: object) -> str:
+    """A value for a message, of bounded length whatever it holds."""
+    try:
+        return reprlib.repr(value)
+    except ValueError:  # a whole number of more digits than Python prints
+        return type(value).__name__
+
+
+def _convert_tuple(value: object, types: tuple[Any, ...], name: str) -> tuple[Any, ...]:
+    """Items of `types`: (item, ...) for any number of them, else one type each."""
+    separator = {int: "x", float: "/"}.get(types[0])
+    expected = "a list"
+    items = value
+    if isinstance(value, str) and separator:
+        items = value.split(separator)
+        expected = (
+            "WIDTHxHEIGHT" if types == (int, int) else f"numbers with {separator} between them"
+        )
+    any_number = len(types) == 2 and types[1] is Ellipsis
+    if not isinstance(items, list) or not (any_number or len(items) == len(types)):
+        raise InputError(f"{name}: expected {expected}, got {shortened(value)}")
+    wanted = [types[0]] * len(items) if any_number else types
+    if items is value:
+        return tuple(convert(item, wanted[i], f"{name}[{i}]") for i, item in enumerate(items))
+    try:
+        return tuple(convert(item, wanted[i], name) for i, item in enumerate(items))
+    except InputError:
+        raise InputError(f"{name}: expected {expected}, got {shortened(value)}") from None
+
+
+def _number(value: object) -> int | float | None:
+    """A finite number, or text that is one; None for anything else."""
+    if isinstance(value, str):
+        for kind in (int, float):
+            try:
+                value = kind(value)
+                break
+            except ValueError:
+                continue
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    return value if abs(value) <= sys.float_info.max else None  # False for NaN
+
+
+def _whole_number(value: object) -> int | None:
+    number = _number(value)
+    if number is None or number != int(number) or abs(number) >= _LARGEST_INTEGER:
+        return None
+    return int(number)
+
+
+def _real_number(value: object) -> float | None:
+    number = _number(value)
+    return None if number is None else float(number)
+
+
+def _boolean(value: object) -> bool | None:
+    if isinstance(value, str):
+        return {"true": True, "false": False}.get(value.lower())
+    return value if isinstance(value, bool) else None
+
+
+_CONVERTERS = {
+    float: _real_number,
+    int: _whole_number,
+    bool: _boolean,
+    str: lambda value: value if isinstance(value, str) else None,
+    Path: lambda value: Path(value).expanduser() if isinstance(value, str) and value else None,
+}

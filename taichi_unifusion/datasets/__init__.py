@@ -4,14 +4,15 @@ indexed and sliced.
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import Any, get_type_hints
 
-from ..errors import DatasetError, InputError
+from ..errors import DatasetError, InputError, convert, did_you_mean, is_convertible
 from .base import Dataset, DatasetView
 
 FORMATS = {  # name -> module here, what opens a recording
@@ -25,34 +26,59 @@ FORMATS = {  # name -> module here, what opens a recording
     "scene": ("scene", "open_scene"),
 }
 
-__all__ = ["FORMATS", "Dataset", "DatasetView", "open_dataset"]
+SENTENCES = {  # what an option of open_dataset means, the same in every format that has it
+    "align": "The camera whose pixels the frames have, depth or color; the paper's is color.",
+    "camera": "The PinholeCamera of the depth images, instead of the recording's.",
+    "classes": "The class of each object by name; others are their own class.",
+    "depth_scale": "Units of the depth images that make a metre.",
+    "drop_alpha": "Accept colour images with a fourth channel and ignore it.",
+    "frames": "Frames of the loop through the room.",
+    "height": "Rows of an image.",
+    "max_difference": "How far time stamps of depth, colour and pose may be apart, in seconds.",
+    "noise": "Depth as a Kinect reads it; false: exact depth.",
+    "seed": "Another number gives other noise.",
+    "trajectory": "File of poses to render from: lines 'timestamp tx ty tz qx qy qz qw'.",
+    "width": "Columns of an image.",
+}
+
+__all__ = [
+    "FORMATS",
+    "Dataset",
+    "DatasetView",
+    "FormatOption",
+    "format_options",
+    "open_dataset",
+    "parse_options",
+]
 
 
-def open_dataset(format: str, path: str | Path | None = None, **options) -> Dataset:
+@dataclass(frozen=True)
+class FormatOption:
+    """An option that `open_dataset` takes for a format."""
+
+    name: str
+    type: Any  # as annotated
+    default: Any  # None: the recording's own, or the format's usual
+    sentence: str
+
+    @property
+    def has_text_form(self) -> bool:
+        """Whether it can be given as text, as NAME=VALUE."""
+        return is_convertible(self.type)
+
+
+def open_dataset(format: str, path: str | Path | None = None, **options: Any) -> Dataset:
     """Open the recording at `path`; frames are read when indexed.
 
-    Recordings take `depth_scale` (units a metre), `camera` (a PinholeCamera of the depth images)
-    and `drop_alpha`, "tum" and "folder" also `max_difference` [s]; "k4a" takes `align`,
-    `depth_scale` and `max_difference`; "synthetic" and "scene" are rendered and have options of
-    their own. Raises DatasetError for an unknown format, a path that does not exist or holds no
-    such recording, InputError for an unknown option.
+    `format_options` says which options a format has. Raises DatasetError for an unknown format, a
+    path that does not exist or holds no such recording, InputError for an unknown option.
     """
-    if format not in FORMATS:
-        raise DatasetError(
-            f"format '{format}' is unknown{_suggest(format, FORMATS)}; formats: {', '.join(FORMATS)}"
-        )
-    module, name = FORMATS[format]
-    opener = getattr(import_module(f".{module}", __name__), name)
-    parameters = inspect.signature(opener).parameters
-    known = [key for key in parameters if key not in ("self", "path")]
+    opener = _opener(format)
+    known = format_options(format)
     for option in options:
-        if option not in known:
-            raise InputError(
-                f"option '{option}' is unknown for format '{format}'{_suggest(option, known)}; "
-                f"options: {', '.join(known)}"
-            )
+        _check_option(option, format, known)
     if path is None:
-        if parameters["path"].default is inspect.Parameter.empty:
+        if inspect.signature(opener).parameters["path"].default is inspect.Parameter.empty:
             raise DatasetError(f"format '{format}' needs the path of a recording")
         return opener(**options)
     path = Path(path).expanduser()
@@ -61,6 +87,55 @@ def open_dataset(format: str, path: str | Path | None = None, **options) -> Data
     return opener(path, **options)
 
 
-def _suggest(word: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(str(word).lower(), list(known), n=1)
-    return f", did you mean '{near[0]}'?" if near else ""
+def format_options(format: str) -> dict[str, FormatOption]:
+    """The options that `open_dataset` takes for a format, by name; DatasetError for an unknown
+    format.
+
+    Some formats import Taichi or PyAV to answer.
+    """
+    opener = _opener(format)
+    types = get_type_hints(opener.__init__ if inspect.isclass(opener) else opener)
+    return {
+        name: FormatOption(name, types[name], parameter.default, SENTENCES[name])
+        for name, parameter in inspect.signature(opener).parameters.items()
+        if name != "path"
+    }
+
+
+def parse_options(format: str, texts: Iterable[str]) -> dict[str, Any]:
+    """Options for `open_dataset` from texts such as "align=color" or "noise=false".
+
+    Raises DatasetError for an unknown format, InputError for an option that is unknown, given
+    twice or has no text form, and for a value of another type.
+    """
+    known = format_options(format)
+    options: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InputError(f"option '{text}': give it as NAME=VALUE")
+        _check_option(name, format, known)
+        if name in options:
+            raise InputError(f"option '{name}' is given twice")
+        if not known[name].has_text_form:
+            raise InputError(f"option '{name}' cannot be given as text, only in Python")
+        options[name] = convert(value, known[name].type, f"option '{name}'")
+    return options
+
+
+def _opener(format: str) -> Callable[..., Dataset]:
+    """The function or class that opens recordings of a format."""
+    if format not in FORMATS:
+        raise DatasetError(
+            f"format '{format}' is unknown{did_you_mean(format, FORMATS)}; formats: {', '.join(FORMATS)}"
+        )
+    module, name = FORMATS[format]
+    return getattr(import_module(f".{module}", __name__), name)
+
+
+def _check_option(name: str, format: str, known: Iterable[str]) -> None:
+    if name not in known:
+        raise InputError(
+            f"option '{name}' is unknown for format '{format}'{did_you_mean(name, known)}; "
+            f"options: {', '.join(known)}"
+        )

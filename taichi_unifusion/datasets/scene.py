@@ -101,7 +101,7 @@ class SceneDataset(Dataset):
 def open_scene(
     path: str | Path,
     *,
-    trajectory: str | Path | Trajectory | None = None,
+    trajectory: Path | str | Trajectory | None = None,
     camera: PinholeCamera | None = None,
     noise: bool = True,
     seed: int = 0,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import io
 import json
 import re
@@ -14,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, InputError
+from ..errors import FileError, InputError, did_you_mean
 from ..files.atomic import read_bytes
 from ..networks.encoders import unit_length
 
@@ -40,11 +39,10 @@ class TextEmbeddings:
             rows = {plain(name): i for i, name in reversed(list(enumerate(self.names)))}
             if plain(text) in rows:
                 return rows[plain(text)]
-        near = difflib.get_close_matches(_plain(text), [_plain(name) for name in self.names], n=3)
+        near = did_you_mean(_plain(text), [_plain(name) for name in self.names], at_most=3)
         raise InputError(
-            f"{self.name}: has no vector for '{text}'"
-            + (f", did you mean {' or '.join(near)}?" if near else ".")
-            + f" It holds {len(self.names)} names; with a text encoder any text can be asked"
+            f"{self.name}: has no vector for '{text}'{near or '.'} It holds {len(self.names)} names; "
+            "with a text encoder any text can be asked"
         )
 
     def has(self, text: str) -> bool:

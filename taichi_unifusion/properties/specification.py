@@ -13,18 +13,14 @@ map.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import inspect
-import math
 import re
-from collections.abc import Collection
 from importlib import import_module
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import get_type_hints
 
 from ..config import Config
-from ..errors import InputError, check_choice
+from ..errors import InputError, convert, did_you_mean
 from ..maps.settings import PropertySettings
 from . import PROPERTIES
 from .base import SurfaceProperty
@@ -45,7 +41,7 @@ def make_property(text: str, settings: PropertySettings | None = None) -> Surfac
     methods = PROPERTIES.get(name)
     if methods is None:
         raise InputError(
-            f"property '{name}' is unknown{_suggest(name, PROPERTIES)}; properties: {', '.join(PROPERTIES)}"
+            f"property '{name}' is unknown{did_you_mean(name, PROPERTIES)}; properties: {', '.join(PROPERTIES)}"
         )
     method, file, options = _split(name, rest, methods)
     module, function = methods[method]
@@ -69,16 +65,16 @@ def make_property(text: str, settings: PropertySettings | None = None) -> Surfac
     for key in options:
         if key not in known:
             raise InputError(
-                f"property '{text}': option '{key}' is unknown{_suggest(key, known)}; options: {', '.join(known)}"
+                f"property '{text}': option '{key}' is unknown{did_you_mean(key, known)}; options: {', '.join(known)}"
             )
     types, map_types = get_type_hints(maker), get_type_hints(PropertySettings)
     given = {
-        key: _convert(value, types[key], f"property '{text}': {key}")
+        key: convert(value, types[key], f"property '{text}': {key}")
         for key, value in options.items()
         if key in parameters
     }
     changes = {
-        key: _convert(value, map_types[key], f"property '{text}': {key}")
+        key: convert(value, map_types[key], f"property '{text}': {key}")
         for key, value in options.items()
         if key in of_map
     }
@@ -98,7 +94,7 @@ def _split(name: str, rest: str, methods: dict) -> tuple[str, str, dict[str, str
             file = first + colon + after
         else:
             raise InputError(
-                f"property '{name}': method '{first}' is unknown{_suggest(first, methods)}; methods: "
+                f"property '{name}': method '{first}' is unknown{did_you_mean(first, methods)}; methods: "
                 f"{', '.join(methods)}"
             )
     options: dict[str, str] = {}
@@ -110,44 +106,3 @@ def _split(name: str, rest: str, methods: dict) -> tuple[str, str, dict[str, str
             )
         options[found[1]] = found[2]
     return method, file, options
-
-
-def _convert(text: str, wanted: Any, at: str) -> Any:
-    """The text as the type `wanted`, or InputError."""
-    if get_origin(wanted) in (Union, type(int | None)):
-        wanted = next(option for option in get_args(wanted) if option is not NoneType)
-    try:
-        if get_origin(wanted) is Literal:
-            check_choice(at, text, get_args(wanted))
-            return text
-        if get_origin(wanted) is tuple:  # a size as 320x240, other numbers as 0.5/0.5/0.5
-            whole = get_args(wanted)[0] is int
-            numbers = tuple(
-                int(word) if whole else _number(word) for word in text.split("x" if whole else "/")
-            )
-            if Ellipsis not in get_args(wanted) and len(numbers) != len(get_args(wanted)):
-                raise ValueError
-            return numbers
-        if wanted is bool:
-            return {"true": True, "false": False}[text.lower()]
-        return {float: _number, int: int, str: str}[wanted](text)
-    except (ValueError, KeyError) as error:
-        if isinstance(error, InputError):
-            raise
-        kinds = {float: "a number", int: "a whole number", bool: "true or false"}
-        kind = kinds.get(wanted) or (
-            "WIDTHxHEIGHT" if get_args(wanted)[0] is int else "numbers with / between them"
-        )
-        raise InputError(f"{at}: expected {kind}, got '{text}'") from None
-
-
-def _number(word: str) -> float:
-    value = float(word)
-    if not math.isfinite(value):
-        raise ValueError
-    return value
-
-
-def _suggest(word: str, known: Collection[str]) -> str:
-    near = difflib.get_close_matches(word.lower(), list(known), n=1)
-    return f", did you mean '{near[0]}'?" if near else ""

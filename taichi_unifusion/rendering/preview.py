@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..errors import InputError
+from ..errors import InputError, check_choice
 from ..files.atomic import atomic_write
 from ..geometry.triangles import area_vectors, vertex_normals
 from ..types import Mesh, PinholeCamera, Trajectory, check_rigid
@@ -88,13 +87,7 @@ def draw_preview(
         else (("camera", "overview") if has_poses else ("overview", "opposite"))
     )
     for name in names:
-        if name not in VIEWS:
-            close = difflib.get_close_matches(str(name), VIEWS, 1)
-            raise InputError(
-                f"preview: unknown view '{name}', "
-                + (f"did you mean '{close[0]}'? " if close else "")
-                + f"There are {', '.join(VIEWS)}"
-            )
+        check_choice("preview: view", name, VIEWS)
         if name == "camera" and not has_poses:
             raise InputError("preview: view 'camera' needs a trajectory")
     drawable = _drawable(mesh)

@@ -176,7 +176,10 @@ def test_a_recording_that_is_none_is_said(tmp_path, recording):
         r"not the factory calibration .*T_color_depth: not a rotation",
         scene.write_k4a(tmp_path / "skew.mkv", 1, attached=json.dumps(spoiled).encode()),
     )
-    with pytest.raises(InputError, match="align: 'colour' is unknown, choose one of depth, color"):
+    with pytest.raises(
+        InputError,
+        match="align: 'colour' is unknown, did you mean 'color'.; choose one of depth, color",
+    ):
         open_dataset("k4a", recording, align="colour")
 
 

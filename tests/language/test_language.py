@@ -93,7 +93,7 @@ def test_names_are_found_as_people_write_them():
     file = embeddings(sofa=[1, 0, 0], television_set=[0, 1, 0], **{"runner_(carpet)": [0, 0, 1]})
     found = file.text_features(["Sofa", "television set", "runner (carpet)", "runner"])
     assert found.argmax(axis=1).tolist() == [0, 1, 2, 2]
-    with pytest.raises(InputError, match="did you mean sofa"):
+    with pytest.raises(InputError, match="did you mean 'sofa'"):
         file.text_features(["soffa"])
 
 

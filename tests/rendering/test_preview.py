@@ -406,7 +406,7 @@ def test_preview_errors_say_what_is_wrong(tmp_path):
         (
             mesh,
             {"views": ["overvew"]},
-            "did you mean 'overview'.*There are camera, overview, opposite",
+            "did you mean 'overview'.*choose one of camera, overview, opposite",
         ),
         (mesh, {"views": ["camera"]}, "needs a trajectory"),
     )
