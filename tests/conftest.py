@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from places import DATA, DEVICE
 
 import taichi_unifusion as uf
-
-DEVICE = os.environ.get("UNIFUSION_DEVICE", "cpu")
-DATA = Path(
-    os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
-)
 
 
 def pytest_configure(config: pytest.Config) -> None:

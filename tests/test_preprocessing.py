@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import reference
+from viewpoints import FINE, rays
 
 from taichi_unifusion import Frame, PinholeCamera, PointCloud, preprocess
 from taichi_unifusion.datasets import open_dataset
@@ -15,21 +16,11 @@ from taichi_unifusion.kernels import images as kernels
 from taichi_unifusion.preprocessing import PreprocessSettings
 
 CAMERA = PinholeCamera(64, 48, 60.0, 62.0, 30.5, 22.0)
-# pixels about as fine as a Kinect's: small steps on slanted planes
-FINE = PinholeCamera(96, 72, 400.0, 410.0, 45.5, 36.0)
 UNIT = 1e-6  # float32 of numbers about 1
 # of normals from noise-free depth: what float32 depth and its inverse leave, with margin
 DEGREE = 1.0
 NORMAL = 1e-3  # float32 slopes of the inverse depth, differences of numbers 1 % apart
 INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
-
-
-def rays(camera: PinholeCamera = CAMERA) -> np.ndarray:
-    """(H, W, 3) directions of unit z."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    return np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
-    )
 
 
 def plane_frame(normal, distance: float = 2.0, camera: PinholeCamera = CAMERA, **values) -> Frame:
@@ -313,13 +304,13 @@ def test_strided_images_are_read_as_they_are():
 @pytest.mark.parametrize(
     "wrong",
     [
-        dict(depth_min=0.0),
-        dict(depth_min=3.0, depth_max=2.0),
-        dict(edge_jump=0.0),
-        dict(edge_support=9),
-        dict(normal_radius=0),
-        dict(max_angle=0.0),
-        dict(max_angle=91.0),
+        {"depth_min": 0.0},
+        {"depth_min": 3.0, "depth_max": 2.0},
+        {"edge_jump": 0.0},
+        {"edge_support": 9},
+        {"normal_radius": 0},
+        {"max_angle": 0.0},
+        {"max_angle": 91.0},
     ],
 )
 def test_settings_that_make_no_sense_are_refused(wrong):

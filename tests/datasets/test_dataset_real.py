@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from places import DATA
 
 from taichi_unifusion.datasets import open_dataset
-
-DATA = Path(
-    os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")
-)
 
 
 def recording(name: str) -> Path:

@@ -6,33 +6,16 @@ import numpy as np
 import pytest
 import reference
 import reference_visibility as twin
+from viewpoints import CAMERA, VS, pose
 
-from taichi_unifusion import PinholeCamera, SurfaceMap
+from taichi_unifusion import SurfaceMap
 from taichi_unifusion.kernels import visibility as kernels
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
-VS = 0.05
-CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 79.5, 59.5)
 ENCODER = EncoderSettings(rank=8, anchors=64)
 FLIPPED = 1e-3  # share of cells in which float32 puts a pixel, or a threshold, on the other side
 EVIDENCE = 1e-4  # [votes] of float32 weights about 1 and votes about 100
-
-
-def pose(position, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
-    """Rigid transform; angles [rad] about y, x and z."""
-    T = np.eye(4)
-    for angle, (i, j) in ((yaw, (2, 0)), (pitch, (1, 2)), (roll, (0, 1))):
-        turn = np.eye(3)
-        turn[[i, j, i, j], [i, j, j, i]] = (
-            np.cos(angle),
-            np.cos(angle),
-            -np.sin(angle),
-            np.sin(angle),
-        )
-        T[:3, :3] = T[:3, :3] @ turn
-    T[:3, 3] = position
-    return T
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mesh_laws import area_and_volume, assert_welded
 from scenes import rough
-from test_meshing import area_and_volume, assert_welded
-from test_visibility import CAMERA, VS, pose
+from viewpoints import CAMERA, VS, pose
 
 from taichi_unifusion import Frame, PointCloud, SurfaceMap, load_map, preprocess
 from taichi_unifusion.errors import InputError, MapCorrupt, OutOfRange, PoseError, SizeMismatch

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_meshing import assert_welded
+from mesh_laws import assert_welded
 
 from taichi_unifusion.maps.meshing import cut_mesh
 

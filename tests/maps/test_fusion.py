@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import reference_fusion as twin
+from map_kinds import KINDS, answers, frames, integrated
+from oracle import LATENT, assert_equal_maps, encoder_of, in_voxels
 from scenes import joined, moved, rough
-from test_map_laws import KINDS, answers, frames, integrated
-from test_regression import LATENT, assert_equal_maps, encoder_of, in_voxels
 
 from taichi_unifusion import PropertyMap, SurfaceMap, load_map
 from taichi_unifusion.errors import MapCorrupt, OutOfRange
@@ -19,7 +19,7 @@ from taichi_unifusion.maps import voxel_grid
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.regressor import sum_count
 
-SIX_RANKS = dict(encoder=EncoderSettings(rank=6, anchors=64), noise=0.3, voxel_size=0.05)
+SIX_RANKS = {"encoder": EncoderSettings(rank=6, anchors=64), "noise": 0.3, "voxel_size": 0.05}
 # relative to the largest latent: Eq. 19 backwards, where a frame of some times the weight is taken
 # out
 MEAN_REST = 2e-5
@@ -235,9 +235,13 @@ def _without_sums(target):
 
 def test_points_of_two_clouds_in_one_or_in_two_frames_are_the_same_regression():
     """With every point a sample, information fusion does not care in which frame a sample came."""
-    settings = dict(
-        fusion="information", sampling="points", min_points=1, voxel_size=0.05, noise=0.3
-    )
+    settings = {
+        "fusion": "information",
+        "sampling": "points",
+        "min_points": 1,
+        "voxel_size": 0.05,
+        "noise": 0.3,
+    }
     clouds = rough(0, 600), rough(1, 500)
     a, b = (
         integrated(

@@ -8,10 +8,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import DEVICE
+from map_kinds import KINDS, SMALL, answers, content, frames, integrated
+from places import DEVICE
 from scenes import cloud_of, moved, rough, taken
 
-from taichi_unifusion import PropertyMap, SurfaceMap, load_map, runtime
+from taichi_unifusion import PropertyMap, load_map, runtime
 from taichi_unifusion.errors import (
     CapacityError,
     InputError,
@@ -28,47 +29,6 @@ FLIPPED = 0.02
 FLIPPED_LATENTS = 40  # times FAR: what such samples change, all of them in thinly filled voxels
 # relative to the largest latent: float32 positions 4800 voxels away are known to 5e-4 voxels
 FAR = 3e-3
-SMALL = dict(encoder=EncoderSettings(rank=8, anchors=64), noise=0.3)
-KINDS = {
-    "surface": lambda **settings: SurfaceMap(**{**SMALL, **settings}),
-    "property": lambda **settings: PropertyMap(
-        "rgb", 3, **{"voxel_size": 0.05, **SMALL, **settings}
-    ),
-}
-
-
-def frames() -> list:
-    """Three overlapping clouds, one of them across the origin and one with voxels of its own."""
-    return [
-        rough(0, 1200),
-        moved(rough(1, 900), (0.05, 0.02, 0)),
-        moved(rough(2, 600), (-0.07, 0.3, 0.1)),
-    ]
-
-
-def probes() -> np.ndarray:
-    return np.random.default_rng(11).uniform(-0.2, 0.2, (500, 3))
-
-
-def answers(target) -> tuple:
-    """What a map decodes: values and validity as bytes."""
-    values, valid = (
-        target.sdf(probes())
-        if isinstance(target, SurfaceMap)
-        else target.query(probes(), return_valid=True)
-    )
-    return values.tobytes(), valid.tobytes(), valid.mean()
-
-
-def content(target) -> tuple[bytes, ...]:
-    data = target._grid.export()
-    return data.keys.tobytes(), data.latents.tobytes(), data.weights.tobytes(), data.masks.tobytes()
-
-
-def integrated(target, clouds):
-    for cloud in clouds:
-        target.integrate(cloud)
-    return target
 
 
 def assert_close(a, b, tolerance: float) -> None:
@@ -160,7 +120,7 @@ def test_N5_another_process_with_another_number_of_threads_writes_the_same_bytes
     script = (
         f"import sys; sys.path[:0] = {sys.path!r}\n"
         f"import taichi_unifusion as uf; uf.init({DEVICE!r}, threads=1)\n"
-        f"from test_map_laws import KINDS, frames, integrated\n"
+        f"from map_kinds import KINDS, frames, integrated\n"
         f"integrated(KINDS[{kind.name!r}](), frames()).save({str(tmp_path / 'there')!r})"
     )
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 import reference
+from mesh_laws import area_and_volume, assert_closed
 from skimage.measure import marching_cubes
 
 from taichi_unifusion.errors import InputError
@@ -36,31 +37,6 @@ def cubes_of(field: np.ndarray, first=(0, 0, 0), keep=None):
 def march(field: np.ndarray, first=(0, 0, 0)):
     keys, upper, samples = cubes_of(field, first)
     return meshing._march(keys, upper, np.full((len(keys), 2), ALL, np.uint32), samples, R, VS)
-
-
-def assert_welded(vertices, faces) -> None:
-    """No unreferenced vertices, none twice, no face with two equal corners."""
-    assert faces.min() == 0 and len(np.unique(faces)) == len(vertices) == faces.max() + 1
-    assert (
-        (faces[:, 0] != faces[:, 1]).all()
-        and (faces[:, 1] != faces[:, 2]).all()
-        and (faces[:, 2] != faces[:, 0]).all()
-    )
-
-
-def assert_closed(vertices, faces) -> None:
-    """Every edge is used exactly once in either direction: a closed, oriented manifold."""
-    assert_welded(vertices, faces)
-    directed = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = set(map(tuple, directed.tolist()))
-    assert len(edges) == len(directed) and all((b, a) in edges for a, b in edges)
-
-
-def area_and_volume(vertices, faces) -> tuple[float, float]:
-    a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, np.einsum(
-        "ni,ni->", a, np.cross(b, c)
-    ) / 6
 
 
 # ---- Tables ----

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from mesh_laws import area_and_volume, assert_closed, assert_welded
 from scenes import box, box_distance, cloud_of, joined, rectangle, sphere, sphere_distance, taken
-from test_meshing import area_and_volume, assert_closed, assert_welded
-from test_preprocessing import FINE, rays
+from viewpoints import FINE, rays
 
 from taichi_unifusion import Frame, PointCloud, SurfaceMap, preprocess
 from taichi_unifusion.errors import InputError
@@ -160,11 +160,11 @@ def test_every_resolution_gives_the_same_closed_surface(scene, resolution):
 @pytest.mark.parametrize(
     "settings",
     [
-        dict(gpis="derivatives"),
-        dict(sampling="points"),
-        dict(sampling="points", gpis="derivatives"),
-        dict(margin=2),
-        dict(noise=0.1, margin=2),
+        {"gpis": "derivatives"},
+        {"sampling": "points"},
+        {"sampling": "points", "gpis": "derivatives"},
+        {"margin": 2},
+        {"noise": 0.1, "margin": 2},
     ],
     ids=lambda settings: "-".join(f"{v}" for v in settings.values()),
 )
@@ -218,15 +218,15 @@ def test_a_cloud_without_normals_is_refused(scene):
 @pytest.mark.parametrize(
     "wrong",
     [
-        dict(voxel_size=0.0),
-        dict(noise=0.0),
-        dict(min_points=0),
-        dict(margin=3),
-        dict(sampling="cell"),
-        dict(gpis="sample"),
-        dict(sample_distance=0.0),
-        dict(sample_distance=1.1),
-        dict(support_points=-1),
+        {"voxel_size": 0.0},
+        {"noise": 0.0},
+        {"min_points": 0},
+        {"margin": 3},
+        {"sampling": "cell"},
+        {"gpis": "sample"},
+        {"sample_distance": 0.0},
+        {"sample_distance": 1.1},
+        {"support_points": -1},
     ],
 )
 def test_settings_that_make_no_map_are_refused_by_name(wrong):

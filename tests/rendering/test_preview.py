@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import DATA
 
 from taichi_unifusion import runtime
 from taichi_unifusion.errors import InputError, PoseError
@@ -15,9 +16,6 @@ from taichi_unifusion.types import Mesh, PinholeCamera, Trajectory
 
 cv2 = pytest.importorskip("cv2")
 
-DATA = Path(
-    os.environ.get("UNIFUSION_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")
-)
 CAMERA = PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5)
 DEPTH_TOLERANCE = 1e-5  # relative: depth is stored as float32
 EDGE_BAND = 1e-5  # barycentric: pixels so near an edge may go to either side

@@ -287,7 +287,7 @@ def surface_frame(encoder, x, normals, settings, encode=encode_voxel):
     """Local surface LIM of a frame: sample-based (Sec. IV-B.2) or derivative-based (IV-B.1) GPIS."""
     derivatives = settings.gpis == "derivatives"
     steps = [0.0] if derivatives else [-settings.sample_distance, 0.0, settings.sample_distance]
-    options = dict(noise=settings.noise, minimum=settings.min_points, encode=encode)
+    options = {"noise": settings.noise, "minimum": settings.min_points, "encode": encode}
     if settings.sampling == "cells":
         cells = bin_surfel_samples(x, normals, steps)
         local = encode_cells(
@@ -308,12 +308,12 @@ def surface_frame(encoder, x, normals, settings, encode=encode_voxel):
 
 def property_frame(encoder, x, values, settings, encode=encode_voxel):
     """Local property LIM of a frame (Eq. 18)."""
-    options = dict(
-        noise=settings.noise,
-        minimum=settings.min_points,
-        centered=settings.prior == "mean",
-        encode=encode,
-    )
+    options = {
+        "noise": settings.noise,
+        "minimum": settings.min_points,
+        "centered": settings.prior == "mean",
+        "encode": encode,
+    }
     cells = bin_points(x, values)
     if settings.sampling == "cells":
         local = encode_cells(encoder, cells, margin=settings.margin, **options)

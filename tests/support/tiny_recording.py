@@ -4,20 +4,19 @@ that fit them.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import yaml
+from places import DEVICE
 
 from taichi_unifusion.config import Config
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.maps.settings import PropertySettings, SurfaceSettings
 from taichi_unifusion.types import Frame
 
-DEVICE = os.environ.get("UNIFUSION_DEVICE", "cpu")
 WIDTH, HEIGHT, DEPTH_SCALE = 160, 120, 1000.0
 
 # A pixel spans 1.4 cm at 2 m: voxels as large as that asks for.

@@ -1,6 +1,6 @@
 """Maps of every kind from two synthetic frames, as hashes.
 
-`python tests/golden/make_maps.py > tests/golden/maps.json` renews what `test_golden.py` compares
+`python tests/maps/golden/make_maps.py > tests/maps/golden/maps.json` renews what `test_golden.py` compares
 with: only where a change is meant to change maps, in the same commit, which says why.
 """
 

@@ -1,0 +1,10 @@
+"""The device that tests run on, and where they find this repository and recordings that it cannot hold."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+DEVICE = os.environ.get("UNIFUSION_DEVICE", "cpu")
+DATA = Path(os.environ.get("UNIFUSION_DATA", ROOT.parent / "shared" / "data"))
