@@ -20,7 +20,7 @@ from .maps import BaseMap, LatentMap, PropertyMap, SurfaceMap
 from .maps.property_group import group_maps
 from .preprocessing import PreprocessSettings, preprocess
 from .properties import SurfaceProperty, make_property
-from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult, name_of
+from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult
 from .types import Frame, Mesh
 
 FEATURES = "features"  # name of the map of image-text features
@@ -79,12 +79,12 @@ class Pipeline:
         """
         clock = StageClock()
         if frame.T_world_camera is None:
-            raise PoseError(f"{name_of(frame)}: there is no pose for this frame")
+            raise PoseError(f"{frame.label}: there is no pose for this frame")
         frame, lacking = self._with_properties(frame, clock)
         with clock.stage("preprocess"):
             cloud = preprocess(frame, self.config.preprocess)
         if len(cloud) == 0:
-            raise EmptyFrame(f"{name_of(frame)}: {_why_empty(frame, self.config.preprocess)}")
+            raise EmptyFrame(f"{frame.label}: {_why_empty(frame, self.config.preprocess)}")
         with clock.stage("transform"):
             cloud = cloud.transformed(frame.T_world_camera)
         with clock.stage("surface"):

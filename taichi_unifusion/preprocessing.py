@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from . import runtime
 from .errors import InputError
-from .types import DepthView, Frame, PointCloud
+from .types import Frame, ImageView, PointCloud
 
 FARTHEST = 1e4  # [m] readings beyond are none
 
@@ -97,7 +97,7 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
     return PointCloud(points, point_normals, attributes, view, frame.features)
 
 
-def _view(frame: Frame, settings: PreprocessSettings) -> DepthView:
+def _view(frame: Frame, settings: PreprocessSettings) -> ImageView:
     """All of a frame's readings: those that are too far for a point still say that space before
     them is free.
     """
@@ -105,7 +105,7 @@ def _view(frame: Frame, settings: PreprocessSettings) -> DepthView:
 
     depth = np.empty_like(frame.depth)
     kernels.clip_depth(np.ascontiguousarray(frame.depth), settings.depth_min, FARTHEST, depth)
-    return DepthView(depth, frame.camera, np.eye(4))
+    return ImageView(depth, frame.camera)
 
 
 def normal_image(frame: Frame, settings: PreprocessSettings | None = None) -> NDArray[np.float32]:

@@ -98,7 +98,7 @@ class RunLog:
             return
         self.scale_checked = bool((frame.depth > 0).any())
         if guess := guess_depth_scale(frame.depth, scale):
-            self.warn(f"{name_of(frame)}: {guess}")
+            self.warn(f"{frame.label}: {guess}")
 
     def check_poses(self, frame: Frame) -> None:
         """Warn if an early pair of frames says that the poses are to be read in another way."""
@@ -111,13 +111,13 @@ class RunLog:
         self.pose_pairs = 0 if decided else self.pose_pairs - 1
         self.reference = frame if self.pose_pairs else None
         if sentence:
-            self.warn(f"{name_of(frame)}: {sentence}")
+            self.warn(f"{frame.label}: {sentence}")
 
     def add_step(self, frame: Frame, step: StepResult, waited: float) -> None:
         if frame.color is None and not self.color_missing:
             self.color_missing = True
             self.warn(
-                f"{name_of(frame)}: there is no colour image; frames without one add to the surface only"
+                f"{frame.label}: there is no colour image; frames without one add to the surface only"
             )
         for name, reason in step.lacking.items():
             if not any(name in earlier.lacking for earlier in self.steps):
@@ -136,12 +136,10 @@ class RunLog:
     def result(self, interrupted: bool, failure: UniFusionError | None) -> RunResult:
         if not self.steps and not interrupted:
             raise failure or DatasetError(self._nothing_used())
-        stamps = [stamp for stamp, _ in self.poses]
-        # no time stamps in this format: TUM's file format gets the frame numbers
-        if None in stamps:
-            stamps = [step.index for step in self.steps]
-        trajectory = Trajectory(
-            np.array(stamps, np.float64), np.array([T for _, T in self.poses]).reshape(-1, 4, 4)
+        trajectory = Trajectory.of(
+            [stamp for stamp, _ in self.poses],
+            [step.index for step in self.steps],
+            [T for _, T in self.poses],
         )
         return RunResult(
             tuple(self.steps),
@@ -159,8 +157,3 @@ class RunLog:
         reason, count = self.reasons.most_common(1)[0]
         first = next(frame.message for frame in self.skipped if frame.reason == reason)
         return f"{self.name}: none of {len(self.skipped)} frames could be used, {count} for '{reason}' (first: {first})"
-
-
-def name_of(frame: Frame) -> str:
-    """The frame in messages."""
-    return frame.name or f"frame {frame.index}"

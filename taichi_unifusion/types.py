@@ -6,7 +6,7 @@ coordinates in a. Metres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -52,6 +52,11 @@ class PinholeCamera:
         return self.width, self.height
 
     @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy) in pixels, as kernels take them."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
     def matrix(self) -> NDArray[np.float64]:
         """The 3x3 matrix K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
@@ -67,6 +72,51 @@ class PinholeCamera:
             (self.cx + 0.5) * sx - 0.5,
             (self.cy + 0.5) * sy - 0.5,
         )
+
+    def shrunk(self, factor: int) -> PinholeCamera:
+        """The camera of an image whose pixels are blocks of factor x factor; a remainder at the
+        right and below is cut off.
+        """
+        return PinholeCamera(
+            self.width // factor,
+            self.height // factor,
+            self.fx / factor,
+            self.fy / factor,
+            (self.cx + 0.5) / factor - 0.5,
+            (self.cy + 0.5) / factor - 0.5,
+        )
+
+    def rays(self, u: NDArray | None = None, v: NDArray | None = None) -> NDArray[np.float64]:
+        """Directions (..., 3) with z = 1 through the pixels at columns u and rows v; without them
+        those of the whole image, (H, W, 3).
+        """
+        if u is None or v is None:
+            u, v = np.arange(self.width), np.arange(self.height)[:, None]
+        u, v = np.asarray(u, np.float64), np.asarray(v, np.float64)
+        rays = np.ones((*np.broadcast_shapes(u.shape, v.shape), 3))
+        rays[..., 0] = (u - self.cx) / self.fx
+        rays[..., 1] = (v - self.cy) / self.fy
+        return rays
+
+    def project(self, points: NDArray) -> NDArray[np.float64]:
+        """Columns u and rows v, (..., 2), of points (..., 3) in the camera frame; NaN for points
+        that are not in front of the camera.
+        """
+        x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
+        z = np.where(z > 0, z, np.nan)
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+
+    def look_up(
+        self, image: NDArray, points: NDArray, nearest: float = 0.0
+    ) -> tuple[NDArray, NDArray[np.bool_]]:
+        """What an image (H, W, ...) of this camera shows at points (N, 3) in the camera frame [m]:
+        values (M, ...) of the M points that are farther than `nearest` and inside it, and which
+        points those are (N,).
+        """
+        u, v = np.rint(self.project(points)).T
+        inside = (u >= 0) & (v >= 0) & (u < self.width) & (v < self.height)
+        inside &= points[:, 2] > nearest
+        return image[v[inside].astype(int), u[inside].astype(int)], inside
 
 
 def check_rigid(T: NDArray, name: str = "T_world_camera") -> NDArray[np.float64]:
@@ -93,28 +143,31 @@ def check_rigid(T: NDArray, name: str = "T_world_camera") -> NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class FeatureImage:
-    """An image of high-dimensional features, as small as its network made it, and where it was
-    taken from.
-    """
+class ImageView:
+    """An image, depth or features, and where it was taken from."""
 
-    values: NDArray[np.float32]  # (h, w, c); pixels that are not finite are left out
+    values: NDArray[np.float32]  # (h, w) or (h, w, c)
     camera: PinholeCamera  # of this image: w x h
-    # (4, 4) from the points it belongs to
+    # (4, 4) from the points that it belongs to
     T_camera_cloud: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
-        if self.values.ndim != 3 or self.values.dtype != np.float32:
+        if self.values.ndim not in (2, 3) or self.values.dtype != np.float32:
             raise FrameError(
-                f"feature image: must be (h, w, c) float32, got {self.values.shape} {self.values.dtype}"
+                f"image: must be (h, w) or (h, w, c) float32, got {self.values.shape} "
+                f"{self.values.dtype}"
             )
         if self.values.shape[1::-1] != self.camera.size:
             raise SizeMismatch(
-                f"feature image: is {self.values.shape[1]}x{self.values.shape[0]} but its camera is "
+                f"image: is {self.values.shape[1]}x{self.values.shape[0]} but its camera is "
                 f"{self.camera.width}x{self.camera.height}"
             )
+        object.__setattr__(self, "values", np.ascontiguousarray(self.values))  # as kernels take it
+        object.__setattr__(
+            self, "T_camera_cloud", check_rigid(self.T_camera_cloud, "T_camera_cloud")
+        )
 
-    def transformed(self, T_b_a: NDArray) -> FeatureImage:
+    def transformed(self, T_b_a: NDArray) -> ImageView:
         """The same image for points that were given in frame a and now are in frame b."""
         return replace(self, T_camera_cloud=self.T_camera_cloud @ np.linalg.inv(T_b_a))
 
@@ -132,10 +185,10 @@ class Frame:
     name: str = ""  # where it came from, for messages
     # property images, (H, W, c)
     images: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    features: Mapping[str, FeatureImage] = field(default_factory=dict)  # of any size, (h, w, c)
+    features: Mapping[str, ImageView] = field(default_factory=dict)  # of any size, (h, w, c)
 
     def __post_init__(self) -> None:
-        at = f"frame {self.name or self.index}"
+        at = self.label
         if self.depth.ndim != 2 or self.depth.dtype != np.float32:
             raise FrameError(
                 f"{at}: depth must be (H, W) float32 in metres, got {self.depth.shape} {self.depth.dtype}"
@@ -161,6 +214,11 @@ class Frame:
             object.__setattr__(
                 self, "T_world_camera", check_rigid(self.T_world_camera, f"{at}: T_world_camera")
             )
+
+    @property
+    def label(self) -> str:
+        """The frame in messages."""
+        return self.name or f"frame {self.index}"
 
     def _check_size(self, at: str, what: str, image: NDArray) -> None:
         if image.shape[:2] != self.depth.shape:
@@ -189,36 +247,10 @@ class Frame:
         values = np.ascontiguousarray(values, dtype=np.float32)
         if values.ndim != 3:
             raise FrameError(
-                f"frame {self.name or self.index}: features '{name}' must be (h, w, c), got {values.shape}"
+                f"{self.label}: features '{name}' must be (h, w, c), got {values.shape}"
             )
-        image = FeatureImage(values, self.camera.resized(values.shape[1], values.shape[0]))
+        image = ImageView(values, self.camera.resized(values.shape[1], values.shape[0]))
         return replace(self, features={**self.features, name: image})
-
-
-@dataclass(frozen=True)
-class DepthView:
-    """From where a cloud was seen: what lies between the camera and the readings is free."""
-
-    depth: NDArray[np.float32]  # (H, W) [m]; 0: no reading
-    camera: PinholeCamera
-    # (4, 4) from the cloud's frame of reference to the camera's
-    T_camera_cloud: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        if (
-            self.depth.shape != (self.camera.height, self.camera.width)
-            or self.depth.dtype != np.float32
-        ):
-            raise SizeMismatch(
-                f"depth view: depth must be ({self.camera.height}, {self.camera.width}) float32 as the camera "
-                f"is, got {self.depth.shape} {self.depth.dtype}"
-            )
-        if not np.isfinite(self.depth.sum()):
-            raise InputError("depth view: depth holds NaN or infinite numbers; 0 means no reading")
-        object.__setattr__(self, "depth", np.ascontiguousarray(self.depth))  # as kernels take it
-        object.__setattr__(
-            self, "T_camera_cloud", check_rigid(self.T_camera_cloud, "T_camera_cloud")
-        )
 
 
 @dataclass(frozen=True)
@@ -231,9 +263,11 @@ class PointCloud:
     normals: NDArray[np.float32] | None = None  # (N, 3) unit, towards the camera
     # name -> (N, c); "color" is RGB in [0, 1]
     attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    view: DepthView | None = None  # from where it was seen, if that is known
-    # images that see these points
-    features: Mapping[str, FeatureImage] = field(default_factory=dict)
+    # the depth image that saw it, if there is one: (H, W) [m], 0: no reading; what lies between the
+    # camera and a reading is free
+    view: ImageView | None = None
+    # (h, w, c) images that see these points; pixels that are not finite are left out
+    features: Mapping[str, ImageView] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, array, columns in (
@@ -264,35 +298,51 @@ class PointCloud:
         )
         if self.normals is not None:
             object.__setattr__(self, "normals", np.ascontiguousarray(self.normals))
+        if self.view is not None and (
+            self.view.values.ndim != 2 or not np.isfinite(self.view.values.sum())
+        ):
+            raise InputError(
+                "point cloud: its view must be a depth image (H, W) of finite numbers, 0 where "
+                "there is no reading"
+            )
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def take(self, rows: NDArray) -> PointCloud:
+        """The points at `rows`, indices (M,) or a mask (N,), with what belongs to them."""
+        return replace(
+            self,
+            points=self.points[rows],
+            normals=None if self.normals is None else self.normals[rows],
+            attributes={name: values[rows] for name, values in self.attributes.items()},
+        )
 
     def transformed(self, T_b_a: NDArray) -> PointCloud:
         """This cloud, given in frame a, in frame b."""
         from . import runtime
 
-        runtime.current()
-        from .kernels.images import (
-            transform,  # Taichi starts with the first kernel, not with the first type
-        )
+        runtime.current()  # Taichi starts with the first kernel, not with the first type
+        from .kernels.images import transform
 
         T_b_a = check_rigid(T_b_a, "T_b_a")
-        T = T_b_a.astype(np.float32)
-        rotation = np.hstack([T[:3, :3], np.zeros((3, 1), np.float32)])
-        moved = []
-        for vectors, matrix in (
-            (self.points, np.ascontiguousarray(T[:3])),
-            (self.normals, rotation),
-        ):
-            moved.append(None if vectors is None else np.empty_like(vectors))
-            if vectors is not None and len(vectors):
-                transform(np.ascontiguousarray(vectors), matrix, moved[-1])
-        view = self.view and replace(
-            self.view, T_camera_cloud=self.view.T_camera_cloud @ np.linalg.inv(T_b_a)
-        )
+        rotation = np.hstack([T_b_a[:3, :3], np.zeros((3, 1))])
+
+        def moved(vectors: NDArray[np.float32], T: NDArray) -> NDArray[np.float32]:
+            result = np.empty_like(vectors)
+            if len(vectors):
+                transform(vectors, np.ascontiguousarray(T, np.float32), result)
+            return result
+
+        view = None if self.view is None else self.view.transformed(T_b_a)
         features = {name: image.transformed(T_b_a) for name, image in self.features.items()}
-        return replace(self, points=moved[0], normals=moved[1], view=view, features=features)
+        return replace(
+            self,
+            points=moved(self.points, T_b_a[:3]),
+            normals=None if self.normals is None else moved(self.normals, rotation),
+            view=view,
+            features=features,
+        )
 
 
 @dataclass(frozen=True)
@@ -350,6 +400,17 @@ class Trajectory:
                 f"trajectory: expected (N,) and (N, 4, 4), got {self.timestamps.shape} and "
                 f"{self.T_world_camera.shape}"
             )
+
+    @classmethod
+    def of(
+        cls,
+        timestamps: Sequence[float | None],
+        numbers: Sequence[int],
+        T_world_camera: Sequence[NDArray],
+    ) -> Trajectory:
+        """Poses of frames; their numbers stand in for time stamps where a recording has none."""
+        stamps = numbers if None in timestamps else timestamps
+        return cls(np.array(stamps, np.float64), np.array(T_world_camera).reshape(-1, 4, 4))
 
     def __len__(self) -> int:
         return len(self.timestamps)

@@ -90,14 +90,8 @@ def _undistortion(
 
 @lru_cache(maxsize=4)
 def camera_rays(camera: PinholeCamera) -> NDArray[np.float32]:
-    """(H, W, 3) rays with z = 1."""
-    x, y = (
-        (np.arange(camera.width) - camera.cx) / camera.fx,
-        (np.arange(camera.height) - camera.cy) / camera.fy,
-    )
-    return np.dstack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))]).astype(
-        np.float32
-    )
+    """(H, W, 3) rays with z = 1, kept: every frame of a recording asks for them."""
+    return camera.rays().astype(np.float32)
 
 
 def project_depth(

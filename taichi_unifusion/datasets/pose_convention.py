@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..types import Frame
 
 GRID = 48  # points along each image axis
+NEAREST = 0.1  # [m] nothing nearer to a camera is compared
 TOLERANCE = 0.03  # share of the depth within which two measurements agree
 # agreement that a right reading has at least, and its lead over a wrong one
 PLAUSIBLE, CLEARLY_BETTER = 0.5, 0.3
@@ -45,16 +46,9 @@ def agreement(a: Frame, b: Frame, T_b_a: NDArray[np.float64]) -> tuple[float, in
     v, u = (x.ravel() for x in np.meshgrid(v, u, indexing="ij"))
     z = a.depth[v, u].astype(np.float64)
     v, u, z = (x[np.isfinite(z) & (z > 0)] for x in (v, u, z))
-    points = np.stack(
-        [(u - a.camera.cx) / a.camera.fx * z, (v - a.camera.cy) / a.camera.fy * z, z], axis=1
-    )
-    x, y, depth = (points @ T_b_a[:3, :3].T + T_b_a[:3, 3]).T
-    front = depth > 0.1
-    u = np.round(b.camera.fx * x[front] / depth[front] + b.camera.cx)
-    v = np.round(b.camera.fy * y[front] / depth[front] + b.camera.cy)
-    inside = (u >= 0) & (u < b.camera.width) & (v >= 0) & (v < b.camera.height)
-    measured = b.depth[v[inside].astype(int), u[inside].astype(int)]
-    wanted = depth[front][inside]
+    points = (a.camera.rays(u, v) * z[:, None]) @ T_b_a[:3, :3].T + T_b_a[:3, 3]  # in b
+    measured, inside = b.camera.look_up(b.depth, points, NEAREST)
+    wanted = points[inside, 2]
     seen = np.isfinite(measured) & (measured > 0)
     if not seen.any():
         return 0.0, 0

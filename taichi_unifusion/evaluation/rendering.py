@@ -103,7 +103,7 @@ def evaluate_rendering(
 def render_frame(caster: RayCaster, frame: Frame, color: ColorAt | None = None) -> RenderedFrame:
     """What the camera of `frame` would see of the caster's mesh; colour as in `evaluate_rendering`."""
     if frame.T_world_camera is None:
-        raise PoseError(f"{frame.name or f'frame {frame.index}'}: there is no pose for this frame")
+        raise PoseError(f"{frame.label}: there is no pose for this frame")
     hits = caster.cast(frame.camera, frame.T_world_camera)
     vertex_colors = caster.mesh.attributes.get("color")
     if color is None and vertex_colors is None:

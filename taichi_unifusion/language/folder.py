@@ -42,7 +42,7 @@ class FolderFeatures:
         stem = Path(frame.name).stem
         path = self.files.get(stem) or self._by_number(stem, frame.index)
         if path is None:
-            raise FrameError(f"{self.name}: has no features for frame {frame.name or frame.index}")
+            raise FrameError(f"{self.name}: has no features for {frame.label}")
         try:
             return unit_length(read_features(path, self.layout))
         except (FileError, InputError) as error:

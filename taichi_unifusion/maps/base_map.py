@@ -290,10 +290,4 @@ def _finite_rows(cloud: PointCloud, observed: NDArray[np.float32]) -> PointCloud
     """The cloud without the points at which something observed is NaN or infinite."""
     if np.isfinite(observed.sum()):  # one pass; a sum is finite only if all its terms are
         return cloud
-    rows = np.isfinite(observed).all(axis=1)
-    return PointCloud(
-        cloud.points[rows],
-        None if cloud.normals is None else cloud.normals[rows],
-        {name: values[rows] for name, values in cloud.attributes.items()},
-        cloud.view,
-    )
+    return cloud.take(np.isfinite(observed).all(axis=1))

@@ -15,7 +15,7 @@ from ..kernels import fusion, regression
 from ..kernels import latent as kernels
 from ..kernels import latent_query as decoding
 from ..kernels.voxels import CELLS
-from ..types import FeatureImage, PointCloud
+from ..types import ImageView, PointCloud
 from .base_map import BaseMap, Integration
 from .encoding import position_encoding
 from .feature_rows import FeatureRows, RowData
@@ -37,7 +37,7 @@ class LatentMap(BaseMap):
     point clouds.
 
         features = LatentMap("clip", channels=512)
-        features.integrate(cloud)                              # cloud.features["clip"]: FeatureImage, (h, w, 512)
+        features.integrate(cloud)                              # cloud.features["clip"]: ImageView, (h, w, 512)
         scores = features.similarity(mesh.vertices, texts)     # (V, n) cosines with texts (n, 512)
 
     A frame's features are never put on its points or pixels: a voxel takes sums over the few
@@ -163,7 +163,7 @@ class LatentMap(BaseMap):
             f"latent map '{self.name}': frames cannot be taken out of a map of features; make it anew"
         )
 
-    def _features_of(self, cloud: PointCloud) -> FeatureImage:
+    def _features_of(self, cloud: PointCloud) -> ImageView:
         features = cloud.features.get(self.name)
         if features is None:
             raise InputError(
@@ -197,7 +197,7 @@ class LatentMap(BaseMap):
         return np.ascontiguousarray(rows), usable.astype(np.uint8)
 
     def _find_pixels(
-        self, blocks: FrameBlocks, features: FeatureImage, usable: NDArray[np.uint8]
+        self, blocks: FrameBlocks, features: ImageView, usable: NDArray[np.uint8]
     ) -> tuple:
         """Feature pixel of every cell (M,), points in every pixel (h w,), and the blocks' points
         that have one (B,).

@@ -110,7 +110,7 @@ class SurfaceMap(BaseMap):
                 grid.latents,
                 self._regressor.cell_gradients,
                 self.voxel_size,
-                view.depth,
+                view.values,
                 camera.fx,
                 camera.fy,
                 camera.cx,

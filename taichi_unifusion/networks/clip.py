@@ -167,14 +167,12 @@ class ClipImageEncoder:
     def image_features(self, frame: Frame) -> NDArray[np.float32]:
         """(h, w, c), unit length; raises FrameError for a frame without colour."""
         if frame.color is None:
-            raise FrameError(f"frame {frame.name or frame.index}: has no colour image for CLIP")
+            raise FrameError(f"{frame.label}: has no colour image for CLIP")
         features = unit_length(
             self._dense(frame.color) if self.method == "dense" else self._crops(frame.color)
         )
         if not np.isfinite(features).any():
-            raise FrameError(
-                f"frame {frame.name or frame.index}: {self.name} gives no finite feature"
-            )
+            raise FrameError(f"{frame.label}: {self.name} gives no finite feature")
         return features
 
     def _dense(self, color: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -58,7 +58,7 @@ class OnnxImageEncoder:
         """(h, w, c), unit length; raises FrameError for a frame without colour or where nothing is
         finite.
         """
-        at = f"frame {frame.name or frame.index}"
+        at = frame.label
         if frame.color is None:
             raise FrameError(f"{at}: has no colour image for {self.name}")
         width, height = self.size or self._like(frame.color)

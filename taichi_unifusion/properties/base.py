@@ -51,7 +51,7 @@ class SurfaceProperty:
         """The property of a frame, (H, W, c); raises FrameError where the frame has none,
         InputError for a wrong function.
         """
-        at = f"property '{self.name}', frame {frame.name or frame.index}"
+        at = f"property '{self.name}', {frame.label}"
         try:
             values = np.asarray(self.function(frame))
         except FrameError as error:

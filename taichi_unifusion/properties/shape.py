@@ -37,16 +37,8 @@ def mean_curvature(*, radius: int = 6) -> SurfaceProperty:
         raise InputError(f"curvature: radius must lie in 1..50 pixels, got {radius}")
 
     def function(frame: Frame) -> NDArray[np.float32]:
-        normals, camera = _normals_of(frame), frame.camera
-        v, u = np.indices(frame.depth.shape, dtype=np.float32)
-        z = frame.depth
-        points = np.dstack(
-            [
-                (u - np.float32(camera.cx)) / np.float32(camera.fx) * z,
-                (v - np.float32(camera.cy)) / np.float32(camera.fy) * z,
-                z,
-            ]
-        )
+        normals = _normals_of(frame)
+        points = frame.camera.rays().astype(np.float32) * frame.depth[..., None]
         return 0.5 * (
             _bend(points, normals, radius)
             + _bend(points.swapaxes(0, 1), normals.swapaxes(0, 1), radius).T

@@ -31,10 +31,7 @@ class RayHits:
     def rays(self, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Directions (N, 3) of the pixels in `mask` in the camera frame, of unit depth, row by row."""
         v, u = np.nonzero(mask)
-        camera = self.camera
-        return np.stack(
-            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1
-        )
+        return self.camera.rays(u, v)
 
     def points(self, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
         """Points hit (N, 3) world [m] by the pixels in `mask`, row by row."""

@@ -87,9 +87,7 @@ class Run:
                 f"{recording.name}: has no poses of the {len(self.used)} frames that {self.directory} was made "
                 "from"
             )
-        return Trajectory(
-            np.array(numbers if None in stamps else stamps, np.float64), np.stack(poses)
-        )
+        return Trajectory.of(stamps, numbers, poses)
 
     def T_recording_run(self) -> NDArray[np.float64]:
         """Takes the run's world to the recording's: the same, unless poses were tracked; then these

@@ -71,12 +71,10 @@ class TrackingResult:
         has none.
         """
         posed = [frame for frame in self.frames if frame.T_world_camera is not None]
-        stamps = [frame.timestamp for frame in posed]
-        if None in stamps:
-            stamps = [frame.index for frame in posed]
-        return Trajectory(
-            np.array(stamps, np.float64),
-            np.array([frame.T_world_camera for frame in posed]).reshape(-1, 4, 4),
+        return Trajectory.of(
+            [frame.timestamp for frame in posed],
+            [frame.index for frame in posed],
+            [frame.T_world_camera for frame in posed],
         )
 
 

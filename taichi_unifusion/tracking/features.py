@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..types import Frame
+from ..types import Frame, PinholeCamera
 
 FEATURES = 800
 LEAST_WIDTH = 320  # [px] smaller images are enlarged: a corner's surroundings are 31 pixels wide
@@ -32,7 +32,7 @@ class Features:
     descriptors: NDArray[np.uint8]  # (N, 32)
     pixels: NDArray[np.float32]  # (N, 2) u, v
     points: NDArray[np.float32]  # (N, 3) camera [m]
-    K: NDArray[np.float64]  # (3, 3)
+    camera: PinholeCamera  # of that image
 
     def __len__(self) -> int:
         return len(self.descriptors)
@@ -40,12 +40,13 @@ class Features:
 
 def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Features:
     """ORB features of a frame at pixels with a reading in range; none where it has no colour."""
-    camera = frame.camera
-    scale = -(-LEAST_WIDTH // camera.width)
-    cx, cy = scale * (camera.cx + 0.5) - 0.5, scale * (camera.cy + 0.5) - 0.5
-    K = np.array([[scale * camera.fx, 0, cx], [0, scale * camera.fy, cy], [0, 0, 1]])
+    scale = -(-LEAST_WIDTH // frame.camera.width)
+    camera = frame.camera.resized(scale * frame.camera.width, scale * frame.camera.height)
     empty = Features(
-        np.empty((0, 32), np.uint8), np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), K
+        np.empty((0, 32), np.uint8),
+        np.empty((0, 2), np.float32),
+        np.empty((0, 3), np.float32),
+        camera,
     )
     if frame.color is None:
         return empty
@@ -59,16 +60,15 @@ def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Featur
     at = (
         np.rint((pixels + 0.5) / scale - 0.5)
         .astype(int)
-        .clip(0, (camera.width - 1, camera.height - 1))
+        .clip(0, (frame.camera.width - 1, frame.camera.height - 1))
     )
     z = frame.depth[at[:, 1], at[:, 0]]
     with np.errstate(invalid="ignore"):
         seen = np.isfinite(z) & (z >= depth_min) & (z <= depth_max)
     order = np.argsort([-corner.response for corner in corners], kind="stable")
     order = order[seen[order]]
-    rays = (pixels[order] - K[:2, 2]) / K[[0, 1], [0, 1]]
-    points = np.column_stack([rays, np.ones(len(order))]) * z[order, None]
-    return Features(descriptors[order], pixels[order], points.astype(np.float32), K)
+    points = camera.rays(*pixels[order].T) * z[order, None]
+    return Features(descriptors[order], pixels[order], points.astype(np.float32), camera)
 
 
 def most_similar(query: Features, others: Sequence[Features], count: int) -> list[int]:
@@ -104,7 +104,7 @@ def locate(query: Features, other: Features) -> NDArray[np.float64] | None:
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         points,
         pixels,
-        query.K,
+        query.camera.matrix,
         None,
         iterationsCount=RANSAC_ITERATIONS,
         reprojectionError=REPROJECTION,

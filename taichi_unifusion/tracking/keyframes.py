@@ -13,6 +13,7 @@ from .features import Features
 from .pyramid import ReducedFrame, SurfelPyramid, build_pyramid
 
 GRID = 16  # [px] between points that stand for a keyframe where the overlap of two is estimated
+NEAR = 0.05  # [m] nothing nearer to a camera is compared
 SAME_DEPTH = 0.1  # share of the depth by which a point and a reading may differ
 LIVE_PYRAMIDS = 24  # 3 MB each; older ones are built again from their images when needed
 
@@ -31,25 +32,15 @@ class Keyframe:
         camera, inverse = self.reduced.camera, self.reduced.inverse
         v, u = np.mgrid[GRID // 2 : camera.height : GRID, GRID // 2 : camera.width : GRID]
         q = inverse[v, u]
-        rays = np.stack(
-            [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
-        )
-        return (rays / np.where(q > 0, q, 1)[..., None])[q > 0].astype(np.float64)
+        return camera.rays(u, v)[q > 0] / q[q > 0][:, None]
 
     def overlap(self, other: Keyframe, T_other_self: NDArray) -> float:
         """Share of its points that the other keyframe sees where it should."""
         if not len(self.points):
             return 0.0
-        x, y, z = T_other_self[:3, :3] @ self.points.T + T_other_self[:3, 3:]
-        camera, front = other.reduced.camera, z > 0.05
-        depth = np.where(front, z, 1.0)
-        u, v = (
-            np.rint(camera.fx * x / depth + camera.cx),
-            np.rint(camera.fy * y / depth + camera.cy),
-        )
-        seen = front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        q = other.reduced.inverse[v[seen].astype(int), u[seen].astype(int)]
-        return float((np.abs(z[seen] * q - 1) < SAME_DEPTH).sum() / len(self.points))
+        points = (T_other_self[:3, :3] @ self.points.T + T_other_self[:3, 3:]).T  # in `other`
+        q, seen = other.reduced.camera.look_up(other.reduced.inverse, points, NEAR)
+        return float((np.abs(points[seen, 2] * q - 1) < SAME_DEPTH).sum() / len(self.points))
 
 
 class Keyframes:

@@ -59,7 +59,7 @@ def reduce_frame(frame: Frame, depth_min: float, depth_max: float) -> ReducedFra
     jump = edge_jump(frame.camera)
     images.drop_flying_pixels(clipped, jump, EDGE_SUPPORT, inverse)
     factor = max(1, frame.camera.width // FINEST_WIDTH)
-    camera = shrunk(frame.camera, factor)
+    camera = frame.camera.shrunk(factor)
     reduced, intensity = (np.zeros((camera.height, camera.width), np.float32) for _ in range(2))
     kernels.average_inverse_depth(inverse, factor, jump, reduced)
     if frame.color is not None:
@@ -85,7 +85,7 @@ def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
         if level:
             if min(camera.size) < 2 * SMALLEST:
                 break
-            camera = shrunk(camera, 2)
+            camera = camera.shrunk(2)
             finer, finer_intensity = inverse, intensity
             inverse, intensity = (
                 np.empty((camera.height, camera.width), np.float32) for _ in range(2)
@@ -115,17 +115,3 @@ def edge_jump(camera: PinholeCamera) -> float:
     fewer pixels see it.
     """
     return EDGE_JUMP * max(1.0, FINEST_WIDTH / camera.width)
-
-
-def shrunk(camera: PinholeCamera, factor: int) -> PinholeCamera:
-    """The camera of an image whose pixels are blocks of factor x factor; a remainder at the right
-    and below is left out.
-    """
-    return PinholeCamera(
-        camera.width // factor,
-        camera.height // factor,
-        camera.fx / factor,
-        camera.fy / factor,
-        (camera.cx + 0.5) / factor - 0.5,
-        (camera.cy + 0.5) / factor - 0.5,
-    )

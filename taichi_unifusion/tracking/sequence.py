@@ -14,7 +14,6 @@ from ..datasets import Dataset, DatasetView
 from ..datasets.loading import index_in_recording, load_ahead
 from ..errors import FrameError, PoseError
 from ..files.atomic import atomic_write
-from ..run_log import name_of
 from ..types import Frame
 from .base import TrackedFrame, Tracker, TrackingResult, Verdict
 from .external import runs
@@ -92,7 +91,7 @@ class PosedFrames(DatasetView):
     def load(self, index: int) -> Frame:
         frame, tracked = super().load(index), self.tracked[index]
         if tracked.T_world_camera is None:
-            raise PoseError(f"{name_of(frame)}: {tracked.verdict}, {tracked.message}")
+            raise PoseError(f"{frame.label}: {tracked.verdict}, {tracked.message}")
         return replace(frame, T_world_camera=tracked.T_world_camera)
 
 

@@ -322,7 +322,7 @@ def test_a_function_that_fails_ends_the_run_and_keeps_what_was_done(frames, monk
     pipeline = Pipeline(CONFIG, properties=[SurfaceProperty("own", 1, fails)])
     run = pipeline.run(frames)
     assert len(run.steps) == HELD_OUT + 1 and isinstance(run.failure, InputError)
-    assert "frame synthetic frame 3: its function failed with KeyError" in str(run.failure)
+    assert "synthetic frame 3: its function failed with KeyError" in str(run.failure)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from taichi_unifusion.tracking.pyramid import (
     SurfelPyramid,
     build_pyramid,
     reduce_frame,
-    shrunk,
 )
 from taichi_unifusion.tracking.registration import Target, evaluate, register
 
@@ -234,7 +233,7 @@ def test_several_targets_have_one_frame_of_reference(room):
 
 def test_a_flat_wall_fixes_nothing_along_it():
     """Geometry alone leaves three motions of a plane open, and the uncertainty says so."""
-    camera = shrunk(SyntheticRoom(frames=1).camera, 2)
+    camera = SyntheticRoom(frames=1).camera.shrunk(2)
     wall = np.zeros((camera.height, camera.width, kernels.CHANNELS), np.float32)
     wall[..., 0], wall[..., 3] = 2.0, -1.0
     import taichi as ti

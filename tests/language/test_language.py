@@ -261,7 +261,7 @@ def test_features_are_found_by_name_or_number_and_have_unit_length(tmp_path):
     assert (
         feature_image(encoder, Frame(FRAME.depth, FRAME.camera, name="depth/0018.png")) == found
     ).all()
-    with pytest.raises(FrameError, match="no features for frame"):
+    with pytest.raises(FrameError, match="no features for 19.png"):
         encoder.image_features(Frame(FRAME.depth, FRAME.camera, name="19.png"))
 
 

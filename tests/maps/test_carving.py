@@ -11,10 +11,17 @@ from scenes import rough
 from viewpoints import CAMERA, VS, pose
 
 from taichi_unifusion import Frame, PointCloud, SurfaceMap, load_map, preprocess
-from taichi_unifusion.errors import InputError, MapCorrupt, OutOfRange, PoseError, SizeMismatch
+from taichi_unifusion.errors import (
+    FrameError,
+    InputError,
+    MapCorrupt,
+    OutOfRange,
+    PoseError,
+    SizeMismatch,
+)
 from taichi_unifusion.files.maps import read_map, write_map
 from taichi_unifusion.maps import voxel_grid
-from taichi_unifusion.types import DepthView
+from taichi_unifusion.types import ImageView
 
 AT_EDGE = 0.1  # [voxels] mean distance of the mesh's border from the true edge, with `carve`...
 NEAR_EDGE = 0.5  # ...and of 95 % of it: two cells
@@ -162,7 +169,7 @@ def test_a_moved_cloud_keeps_its_view():
     back = there.view.T_camera_cloud[:3, :3] @ there.points.T + there.view.T_camera_cloud[:3, 3:]
     np.testing.assert_allclose(back.T, cloud.points, atol=1e-5)
     assert (
-        there.view.depth is cloud.view.depth
+        there.view.values is cloud.view.values
         and PointCloud(cloud.points).transformed(T).view is None
     )
 
@@ -171,13 +178,13 @@ def test_a_view_that_makes_no_sense_is_refused():
     good = np.ones((120, 160), np.float32)
     for depth, T, error in (
         (good[:, :9], np.eye(4), SizeMismatch),
-        (good.astype(float), np.eye(4), SizeMismatch),
+        (good.astype(float), np.eye(4), FrameError),
         (good * np.nan, np.eye(4), InputError),
         (good, 2 * np.eye(4), PoseError),
     ):
         with pytest.raises(error):
-            DepthView(depth, CAMERA, T)
-    assert DepthView(np.asfortranarray(good), CAMERA, np.eye(4)).depth.flags.c_contiguous
+            PointCloud(np.zeros((1, 3), np.float32), view=ImageView(depth, CAMERA, T))
+    assert ImageView(np.asfortranarray(good), CAMERA).values.flags.c_contiguous
 
 
 # ---- Evidence in maps and files ----

@@ -15,7 +15,7 @@ from taichi_unifusion.errors import FrameError, InputError, MapCorrupt
 from taichi_unifusion.files.maps import read_map, write_map
 from taichi_unifusion.kernels import latent, latent_query
 from taichi_unifusion.maps import LatentMap
-from taichi_unifusion.types import FeatureImage
+from taichi_unifusion.types import ImageView
 
 # table of position features, half precision, slopes of 255 levels
 TWIN = {"float32": 2e-3, "float16": 2e-3, "int8": 5e-3}
@@ -52,7 +52,7 @@ def view(seed: int, channels: int = 20, count: int = 4000, values=None) -> Point
     if values is None:
         values = rng.standard_normal((CAMERA.height, CAMERA.width, channels)) / np.sqrt(channels)
     T_camera_world = np.linalg.inv(facing(0.2 * seed - 0.3, 1.0 + 0.1 * seed))
-    image = FeatureImage(np.ascontiguousarray(values, np.float32), CAMERA, T_camera_world)
+    image = ImageView(np.ascontiguousarray(values, np.float32), CAMERA, T_camera_world)
     return PointCloud(points, features={"clip": image})
 
 

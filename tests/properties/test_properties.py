@@ -84,7 +84,7 @@ def test_infrared_between_limits_is_linear_and_clipped():
 def test_a_frame_without_infrared_is_said():
     with pytest.raises(
         FrameError,
-        match="property 'infrared', frame shot-000017.depth.png: the recording has no infrared",
+        match="property 'infrared', shot-000017.depth.png: the recording has no infrared",
     ):
         make_property("infrared").image(frame_of())
 
@@ -368,7 +368,7 @@ def test_a_function_is_checked_at_every_frame():
     told(
         lambda frame: frame.depth.no,
         InputError,
-        "own', frame shot.*: its function failed with AttributeError: .*'no'",
+        "own', shot.*: its function failed with AttributeError: .*'no'",
     )
     told(lambda frame: frame.depth * np.nan, FrameError, "all values are NaN or infinite")
     partly = SurfaceProperty(

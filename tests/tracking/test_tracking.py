@@ -186,7 +186,7 @@ def test_features_of_a_small_image_say_the_same():
         locate(second, first), se3.inverse(room[0].T_world_camera) @ room[3].T_world_camera
     )
     assert distance < 0.15 and np.degrees(angle) < 6
-    seen = first.points[:, :2] / first.points[:, 2:] * first.K[[0, 1], [0, 1]] + first.K[:2, 2]
+    seen = first.camera.project(first.points)
     np.testing.assert_allclose(seen, first.pixels, atol=1e-3)
 
 
