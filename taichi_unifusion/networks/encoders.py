@@ -40,9 +40,7 @@ def feature_image(encoder: ImageEncoder, frame: Frame) -> NDArray[np.float32]:
         )
     values = unit_length(values)
     if not np.isfinite(values).any():
-        raise FrameError(
-            f"{encoder.name}: not one feature of frame {frame.name or frame.index} is finite"
-        )
+        raise FrameError(f"{encoder.name}: not one feature of {frame.label} is finite")
     return values
 
 
