@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import taichi_unifusion as uf
-from taichi_unifusion.files.meshes import read_mesh
+from taichi_unifusion.files.mesh_reading import read_mesh
 
 README = Path(__file__).parents[1] / "README.md"
 

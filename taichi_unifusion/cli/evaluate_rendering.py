@@ -84,7 +84,7 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     from ..config import Config
     from ..evaluation.rendering import WITHIN
     from ..evaluation.rendering import evaluate_rendering as evaluate
-    from ..files.foreign_meshes import read_any_mesh
+    from ..files.mesh_reading import read_any_mesh
     from ..results.reader import find_run
 
     run = find_run(options.reconstruction)

@@ -60,7 +60,7 @@ def evaluate_surface(options: EvaluateSurface) -> int:
     options.check_out()
     from .. import runtime
     from ..evaluation.surface import evaluate_surface as evaluate
-    from ..files.foreign_meshes import read_any_mesh
+    from ..files.mesh_reading import read_any_mesh
     from ..results.reader import find_run, read_run
 
     run = find_run(options.reconstruction)

@@ -108,7 +108,7 @@ def read_labels_file(path: Path) -> dict[int, str]:
 
 
 def _read_truth(path: Path) -> Any:
-    from ..files.meshes import read_mesh
+    from ..files.mesh_reading import read_mesh
 
     mesh = read_mesh(path)
     if "label" not in mesh.attributes:

@@ -95,7 +95,7 @@ def read_understood(directory: Path, device: str) -> Understood:
     missing or damaged.
     """
     from .. import runtime
-    from ..files.meshes import read_mesh
+    from ..files.mesh_reading import read_mesh
     from ..files.trajectories import read_trajectory
     from ..maps import LatentMap
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
 from .atomic import read_bytes
-from .meshes import read_mesh
+from .mesh_reading import read_mesh
 
 SUFFIXES = (".ply", ".txt", ".npy")
 

@@ -1,4 +1,4 @@
-"""Meshes in files: PLY, written and read; GLB and OBJ, written."""
+"""Meshes written: PLY, GLB and OBJ. `mesh_reading` reads them."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import os
 from pathlib import Path
 
 from ..errors import InputError, MissingDependency
-from ..types import Mesh
-from .atomic import atomic_write, read_bytes
-from .ply import color_to_uint8, parse_ply, write_ply
+from .atomic import atomic_write
+from .ply import Triangles, color_to_uint8, write_ply
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 
 
-def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
+def write_mesh(path: str | os.PathLike, mesh: Triangles) -> None:
     """Write `mesh` atomically; the suffix of `path` chooses PLY (binary), GLB or OBJ.
 
     Attribute "color" becomes 8-bit RGB. PLY holds all other attributes as float properties, GLB and
@@ -40,17 +39,7 @@ def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
             temporary.write_bytes(content)
 
 
-def read_mesh(path: str | os.PathLike) -> Mesh:
-    """Read a PLY mesh, ours or another program's; raises FileError where it is missing, truncated
-    or inconsistent.
-    """
-    path = Path(path)
-    if path.suffix.lower() != ".ply":
-        raise InputError(f"{path}: meshes are read from .ply, not from '{path.suffix}'")
-    return parse_ply(read_bytes(path), name=str(path))
-
-
-def _encode_with_trimesh(path: Path, mesh: Mesh) -> bytes:
+def _encode_with_trimesh(path: Path, mesh: Triangles) -> bytes:
     """The bytes of a GLB or OBJ file, vertices and faces in their order."""
     if not len(mesh.faces):
         raise InputError(

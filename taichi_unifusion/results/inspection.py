@@ -11,7 +11,7 @@ from ..cli.terminal import format_bytes, format_table
 from ..errors import FileError, MapCorrupt, UniFusionError
 from ..files.atomic import read_bytes
 from ..files.maps import read_map
-from ..files.meshes import read_mesh
+from ..files.mesh_reading import read_mesh
 
 MAP_COLUMNS = ["map", "kind", "voxels", "voxel size", "file", "encoder", "fusion", "version"]
 

@@ -20,7 +20,7 @@ from ..errors import DatasetError, FileError, FrameError
 from ..evaluation.trajectory import align_poses, match_poses
 from ..evaluation.viewpoints import Viewpoints
 from ..files.atomic import read_bytes
-from ..files.meshes import read_mesh
+from ..files.mesh_reading import read_mesh
 from ..files.trajectories import read_trajectory
 from ..types import Mesh, Trajectory
 

@@ -27,7 +27,7 @@ from taichi_unifusion.cli import main as cli
 from taichi_unifusion.cli.info import Info
 from taichi_unifusion.config import Config, dump_config, load_config
 from taichi_unifusion.files.maps import read_map
-from taichi_unifusion.files.meshes import read_mesh
+from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.files.trajectories import read_trajectory
 from taichi_unifusion.results import writer as results
 

@@ -17,8 +17,7 @@ from taichi_unifusion import Trajectory, load_map, open_dataset
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.errors import FileError
 from taichi_unifusion.evaluation import Viewpoints, evaluate_rendering, evaluate_surface
-from taichi_unifusion.files.foreign_meshes import read_any_mesh
-from taichi_unifusion.files.meshes import read_mesh
+from taichi_unifusion.files.mesh_reading import read_any_mesh, read_mesh
 from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
 from taichi_unifusion.geometry import triangles as geometry
 from taichi_unifusion.results.reader import read_run

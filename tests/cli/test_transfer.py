@@ -20,7 +20,7 @@ from taichi_unifusion import Pipeline, PropertyMap
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.config import dump_config, load_config
 from taichi_unifusion.errors import InputError
-from taichi_unifusion.files.meshes import read_mesh
+from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.properties import Look, SurfaceProperty
 from taichi_unifusion.rendering.legend import HEIGHT
 from taichi_unifusion.results.writer import write_results

@@ -11,7 +11,7 @@ from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 
 from taichi_unifusion import Pipeline, load_map
 from taichi_unifusion.cli import main as cli
-from taichi_unifusion.files.meshes import read_mesh
+from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.maps import LatentMap
 from taichi_unifusion.results.writer import write_results
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from taichi_unifusion.errors import FileError, InputError
-from taichi_unifusion.files.meshes import read_mesh, write_mesh
+from taichi_unifusion.files.mesh_reading import read_mesh
+from taichi_unifusion.files.meshes import write_mesh
 from taichi_unifusion.types import Mesh
 
 COLOR_STEP = 0.5 / 255 + 1e-6  # half a step of 8 bits, and float32 rounding

@@ -1,16 +1,28 @@
-"""Meshes of any program: ours and other PLY files directly, the rest by trimesh."""
+"""Meshes read: PLY of any program directly, other formats by trimesh."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import FileError, InputError
 from ..types import Mesh
-from .meshes import read_mesh
+from .atomic import read_bytes
+from .ply_reading import parse_ply
 
 SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")
+
+
+def read_mesh(path: str | os.PathLike[str]) -> Mesh:
+    """Read a PLY mesh, ours or another program's; raises FileError where it is missing, truncated
+    or inconsistent.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: meshes are read from .ply, not from '{path.suffix}'")
+    return parse_ply(read_bytes(path), name=str(path))
 
 
 def read_any_mesh(path: str | Path) -> Mesh:
@@ -33,7 +45,7 @@ def read_any_mesh(path: str | Path) -> Mesh:
 
     try:
         return _joined(trimesh.load_scene(path, process=False))
-    except Exception as error:  # its readers raise whatever they stumble over
+    except Exception as error:  # noqa: BLE001 - its readers raise whatever they stumble over
         reason = " ".join(str(error).split())[:200]
         raise FileError(
             f"{path}: cannot be read as a mesh ({type(error).__name__}: {reason})"
