@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import runtime
 from ..errors import InputError, check_choice
 from ..files.atomic import atomic_write
 from ..geometry.triangles import area_vectors, vertex_normals
 from ..types import Mesh, PinholeCamera, Trajectory, check_rigid
+from .depth_buffer import DepthBuffer, draw_depth_buffer
 
 VIEWS = {  # name -> what it shows
     "camera": "from a camera of the recording, drawn back a little",
@@ -155,7 +155,7 @@ def _drawable(mesh: Mesh) -> _Drawable:
 
 def _draw(drawable: _Drawable, view: Viewpoint) -> NDArray[np.uint8]:
     camera = view.camera.resized(view.camera.width * SAMPLES, view.camera.height * SAMPLES)
-    nearest, projection = _rasterize(drawable, camera, view.T_world_camera, view.near)
+    drawn = _depth_buffer(drawable, camera, view.T_world_camera, view.near)
     import taichi as ti
 
     from .kernels.raster import shade_pixels
@@ -168,10 +168,10 @@ def _draw(drawable: _Drawable, view: Viewpoint) -> NDArray[np.uint8]:
         drawable.normals,
         drawable.colors,
         drawable.faces,
-        projection,
+        drawn.projection,
         ti.math.mat3(T_camera_world[:3, :3].tolist()),
         ti.math.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
-        nearest,
+        drawn.nearest,
         ti.math.vec4(*light, drawable.shading),
         OCCLUSION_RADIUS,
         OCCLUSION_TAPS,
@@ -181,17 +181,13 @@ def _draw(drawable: _Drawable, view: Viewpoint) -> NDArray[np.uint8]:
     return image
 
 
-def _rasterize(
+def _depth_buffer(
     drawable: _Drawable, camera: PinholeCamera, T_world_camera: NDArray, near: float
-) -> tuple[NDArray, NDArray]:
-    """Depth buffer (H, W) and projection (3, 4) as in kernels/raster.py."""
-    runtime.current()  # before Taichi is imported: it says what it starts
-    from .kernels.raster import rasterize
-
-    projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(T_world_camera)[:3])
-    nearest = np.empty((camera.height, camera.width), np.int64)
-    rasterize(drawable.vertices, drawable.faces, 0, projection, near, nearest)
-    return nearest, projection
+) -> DepthBuffer:
+    """The depth buffer (H, W) of the sides that face the camera."""
+    return draw_depth_buffer(
+        drawable.vertices, drawable.faces, camera, T_world_camera, near, two_sided=False
+    )
 
 
 def write_png(path: str | os.PathLike, image: NDArray[np.uint8]) -> None:
@@ -354,8 +350,5 @@ def _seen_depth(drawable: _Drawable, T_world_camera: NDArray) -> NDArray[np.floa
     """A small depth image [m] of the mesh from a recorded camera, 0 where there is none or its back
     is seen.
     """
-    nearest, _ = _rasterize(
-        drawable, _pinhole(THUMBNAIL, JUDGED_FOV), T_world_camera, Viewpoint.near
-    )
-    depth = (nearest >> 32).astype(np.int32).view(np.float32)
-    return np.where(nearest == np.iinfo(np.int64).max, np.float32(0), depth)
+    camera = _pinhole(THUMBNAIL, JUDGED_FOV)
+    return _depth_buffer(drawable, camera, T_world_camera, Viewpoint.near).depth(nothing=0.0)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import runtime
 from ..types import Mesh, PinholeCamera, check_rigid
+from .depth_buffer import draw_depth_buffer
 from .mesh_checks import check_mesh
 
 NEAR = 1e-3  # [m] nothing nearer to the camera is hit
@@ -57,16 +57,10 @@ class RayCaster:
         transform.
         """
         T_world_camera = check_rigid(T_world_camera)
-        runtime.current()  # before Taichi is imported: it says what it starts
-        from .kernels.raster import EMPTY, rasterize
-
-        projection = np.ascontiguousarray(camera.matrix @ np.linalg.inv(T_world_camera)[:3])
-        nearest = np.empty((camera.height, camera.width), np.int64)
-        rasterize(self.mesh.vertices, self.mesh.faces, 1, projection, NEAR, nearest)
-        empty = nearest == EMPTY
-        depth = (nearest >> 32).astype(np.int32).view(np.float32)
-        triangle = np.where(empty, -1, nearest & 0xFFFFFFFF).astype(np.int32)
-        return RayHits(np.where(empty, np.float32(np.inf), depth), triangle, camera, T_world_camera)
+        drawn = draw_depth_buffer(
+            self.mesh.vertices, self.mesh.faces, camera, T_world_camera, NEAR, two_sided=True
+        )
+        return RayHits(drawn.depth(nothing=np.inf), drawn.triangle(), camera, T_world_camera)
 
     def interpolate(
         self, hits: RayHits, mask: NDArray[np.bool_], values: NDArray

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..errors import CapacityError, DatasetError, MissingDependency, UniFusionError
 from ..types import Mesh, PinholeCamera, check_rigid
+from .depth_buffer import DepthBuffer, draw_depth_buffer
 
 NEAR_PLANE = 0.02  # [m] nothing nearer is drawn
 LIGHT = (0.36, 0.24, 0.9)  # towards the light, world; not unit
@@ -69,7 +70,7 @@ class TexturedScene:
         from .kernels.texturing import SAMPLES, shade_textured
 
         finer = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
-        nearest, projection = self._rasterize(finer, T_world_camera)
+        drawn = self._depth_buffer(finer, T_world_camera)
         color = np.empty((camera.height, camera.width, 3), np.uint8)
         light = np.array(LIGHT) / np.linalg.norm(LIGHT)
         shade_textured(
@@ -81,10 +82,10 @@ class TexturedScene:
             on_device.textures,
             on_device.levels,
             on_device.texels,
-            projection,
+            drawn.projection,
             ti.math.vec3(light),
             ti.math.vec3(BACKGROUND),
-            nearest,
+            drawn.nearest,
             color,
         )
         return SceneImages(color=color, **self._surfaces(camera, T_world_camera))
@@ -97,23 +98,21 @@ class TexturedScene:
         """Object (H, W) alone, row of object_names, -1 where nothing is hit."""
         return self._surfaces(camera, T_world_camera)["object"]
 
-    def _rasterize(
-        self, camera: PinholeCamera, T_world_camera: NDArray
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Depth buffer (H, W) and projection (3, 4) as in kernels/raster.py."""
+    def _depth_buffer(self, camera: PinholeCamera, T_world_camera: NDArray) -> DepthBuffer:
+        """Both sides of every triangle, as `camera` sees them."""
         on_device = self._on_device
-        from .kernels.raster import rasterize
-
-        projection = np.ascontiguousarray(
-            camera.matrix @ np.linalg.inv(check_rigid(T_world_camera))[:3]
+        return draw_depth_buffer(
+            on_device.vertices,
+            on_device.faces,
+            camera,
+            check_rigid(T_world_camera),
+            NEAR_PLANE,
+            two_sided=True,
         )
-        nearest = np.empty((camera.height, camera.width), np.int64)
-        rasterize(on_device.vertices, on_device.faces, 1, projection, NEAR_PLANE, nearest)
-        return nearest, projection
 
     def _surfaces(self, camera: PinholeCamera, T_world_camera: NDArray) -> dict[str, NDArray]:
         """Depth, cosine and object of every pixel."""
-        nearest, _ = self._rasterize(camera, T_world_camera)
+        nearest = self._depth_buffer(camera, T_world_camera).nearest
         import taichi as ti
 
         from .kernels.texturing import read_surfaces
