@@ -13,13 +13,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
 from ..types import Frame
 from .encoders import unit_length
+from .image_input import normalized, resized, whole_patches
 
 NORMALIZATION = {  # model type -> mean and standard deviation of the training images, where the folder does not say
     "clip": ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)),
@@ -148,14 +148,10 @@ class ClipModel:
     def _tensor(self, images: NDArray[np.float32]) -> Any:
         return self.torch.from_numpy(images).to(self.device, next(self.model.parameters()).dtype)
 
-    def normalized(self, color: NDArray[np.uint8], width: int, height: int) -> NDArray[np.float32]:
-        """An image (H, W, 3) as the network takes it, (3, height, width)."""
-        smaller = width < color.shape[1]
-        resized = cv2.resize(
-            color, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
-        )
-        scaled = (resized.astype(np.float32) / 255 - np.float32(self.mean)) / np.float32(self.std)
-        return np.ascontiguousarray(scaled.transpose(2, 0, 1))
+    def prepared(self, color: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
+        """An image (H, W, 3) as the network takes it, (3, height, width); `size` is (width, height)."""
+        image = normalized(resized(color, size), self.mean, self.std)
+        return np.ascontiguousarray(image.transpose(2, 0, 1))
 
 
 class ClipImageEncoder:
@@ -176,9 +172,8 @@ class ClipImageEncoder:
         return features
 
     def _dense(self, color: NDArray[np.uint8]) -> NDArray[np.float32]:
-        patch, scale = self.model.patch, self.short_side / min(color.shape[:2])
-        height, width = (max(round(side * scale / patch), 1) * patch for side in color.shape[:2])
-        return self.model.dense_features(self.model.normalized(color, width, height)[None])[0]
+        size = whole_patches(color, self.short_side, self.model.patch)
+        return self.model.dense_features(self.model.prepared(color, size)[None])[0]
 
     def _crops(self, color: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Mean over the windows that hold a pixel, each counting by how central the pixel lies in
@@ -193,10 +188,9 @@ class ClipImageEncoder:
             batch = windows[first : first + BATCH]
             images = np.stack(
                 [
-                    self.model.normalized(
+                    self.model.prepared(
                         np.ascontiguousarray(color[y : y + edge, x : x + edge]),
-                        self.model.window,
-                        self.model.window,
+                        (self.model.window, self.model.window),
                     )
                     for y, x, edge in batch
                 ]

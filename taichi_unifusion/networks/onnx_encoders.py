@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,10 +13,10 @@ from ..errors import FrameError, InputError
 from ..types import Frame
 from .clip import NORMALIZATION, SHORT_SIDE
 from .encoders import unit_length
+from .image_input import FLOATS, find_image_input, normalized, resized, whole_patches
 from .onnx_session import open_session, run_session
 from .tokenizer import ClipTokenizer
 
-IMAGE_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 TOKEN_TYPES = {"tensor(int64)": np.int64, "tensor(int32)": np.int32}
 TEXT_LENGTH = 77  # of CLIP
 
@@ -38,21 +37,7 @@ class OnnxImageEncoder:
     ) -> None:
         self.name, self.mean, self.std, self.patch = f"onnx:{file}", mean, std, patch
         self.session = open_session(file, device)
-        inputs = self.session.get_inputs()
-        if (
-            len(inputs) != 1
-            or len(inputs[0].shape) != 4
-            or inputs[0].shape[1] != 3
-            or inputs[0].type not in IMAGE_TYPES
-        ):
-            raise InputError(f"{file}: takes {_described(inputs)}, not one image (1, 3, H, W)")
-        self.input = inputs[0]
-        height, width = (side if isinstance(side, int) else None for side in self.input.shape[2:])
-        if size and (width not in (size[0], None) or height not in (size[1], None)):
-            raise InputError(
-                f"{file}: takes images of {width}x{height}, not of {size[0]}x{size[1]}"
-            )
-        self.size = (width, height) if width and height else size
+        self.input = find_image_input(self.session, file, size, FLOATS)
 
     def image_features(self, frame: Frame) -> NDArray[np.float32]:
         """(h, w, c), unit length; raises FrameError for a frame without colour or where nothing is
@@ -61,33 +46,17 @@ class OnnxImageEncoder:
         at = frame.label
         if frame.color is None:
             raise FrameError(f"{at}: has no colour image for {self.name}")
-        width, height = self.size or self._like(frame.color)
-        smaller = width < frame.color.shape[1]
-        image = cv2.resize(
-            frame.color,
-            (width, height),
-            interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC,
-        )
-        image = (
-            (image.astype(np.float32) / 255 - np.float32(self.mean)) / np.float32(self.std)
-        ).transpose(2, 0, 1)[None]
+        width, height = self.input.size or whole_patches(frame.color, SHORT_SIDE, self.patch)
+        image = normalized(resized(frame.color, (width, height)), self.mean, self.std)
         raw = run_session(
             self.session,
-            {self.input.name: np.ascontiguousarray(image, IMAGE_TYPES[self.input.type])},
+            self.input.feed(image),
             failure=f"{self.name}: fails on an image of {width}x{height}",
         )
-        features = unit_length(self._as_image(np.asarray(raw), height, width))
+        features = unit_length(self._as_image(raw, height, width))
         if not np.isfinite(features).any():
             raise FrameError(f"{at}: {self.name} gives no finite feature")
         return features
-
-    def _like(self, color: NDArray) -> tuple[int, int]:
-        """(width, height) of about the image's shape in whole patches."""
-        scale = SHORT_SIDE / min(color.shape[:2])
-        height, width = (
-            max(round(side * scale / self.patch), 1) * self.patch for side in color.shape[:2]
-        )
-        return width, height
 
     def _as_image(self, raw: NDArray, height: int, width: int) -> NDArray[np.float32]:
         if raw.ndim == 4 and raw.shape[0] == 1:
@@ -141,7 +110,7 @@ class OnnxTextEncoder:
             raw = run_session(
                 self.session, feeds, failure=f"{self.name}: fails on {len(part)} texts"
             )
-            found.append(np.asarray(raw)[: len(part)])
+            found.append(raw[: len(part)])
         vectors = np.concatenate(found)
         if vectors.ndim != 2 or not np.isfinite(vectors).all():
             raise InputError(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, MissingDependency, check_choice
 
@@ -47,13 +51,19 @@ def open_session(file: str | Path, device: str = "auto") -> InferenceSession:
         ) from error
 
 
-def run_session(session: InferenceSession, feeds: dict, output: str | None = None, *, failure: str):
+def run_session(
+    session: InferenceSession,
+    feeds: Mapping[str, NDArray],
+    output: str | None = None,
+    *,
+    failure: str,
+) -> NDArray:
     """The network's output of that name, or its first; raises InputError that begins with `failure`
     where it fails.
     """
     try:
-        return session.run(None if output is None else [output], feeds)[0]
-    except Exception as error:
+        return np.asarray(session.run(None if output is None else [output], dict(feeds))[0])
+    except Exception as error:  # onnxruntime has a class of its own for every kind
         raise InputError(f"{failure} ({first_line(error)})") from error
 
 

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, check_choice
-from ..networks.image_network import (
+from ..networks.image_input import (
     IMAGENET_MEAN,
     IMAGENET_STD,
-    ImageNetwork,
-    check_preparation,
-    prepare,
+    check_normalization,
+    normalized,
 )
+from ..networks.image_network import ImageNetwork
 from ..rendering.look import Look
 from ..types import Frame
 from .base import SurfaceProperty, color_of
@@ -82,12 +82,12 @@ def network_saliency(
     `output` (the first): nothing, sigmoid, or stretching each frame to [0, 1].
     """
     check_choice("activation", activation, ("none", "sigmoid", "minmax"))
-    check_preparation(scale, mean, std, order)
+    check_normalization(scale, mean, std, order)
     network = ImageNetwork(file, size=size, output=output, channels=1, device=device, sha256=sha256)
 
     def function(frame: Frame) -> NDArray[np.float32]:
         color = color_of(frame)
-        values = network(prepare(color, scale, mean, std, order), color.shape[:2])[..., 0]
+        values = network(normalized(color, mean, std, scale, order), color.shape[:2])[..., 0]
         if activation == "sigmoid":
             return 1 / (1 + np.exp(-np.clip(values, -60, 60)))
         low, high = float(values.min()), float(values.max())

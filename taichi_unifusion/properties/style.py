@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..networks.image_network import ImageNetwork, check_preparation, prepare
+from ..networks.image_input import check_normalization, normalized
+from ..networks.image_network import ImageNetwork
 from ..rendering.look import Look
 from ..types import Frame
 from .base import SurfaceProperty, color_of
@@ -104,12 +105,12 @@ def network_style(
     """
     if not output_scale > 0:
         raise InputError(f"style: output_scale must be positive, got {output_scale}")
-    check_preparation(scale, mean, std, order)
+    check_normalization(scale, mean, std, order)
     network = ImageNetwork(file, size=size, output=output, channels=3, device=device, sha256=sha256)
 
     def function(frame: Frame) -> NDArray[np.float32]:
         color = color_of(frame)
-        values = network(prepare(color, scale, mean, std, order), color.shape[:2])
+        values = network(normalized(color, mean, std, scale, order), color.shape[:2])
         largest = float(np.abs(values).max())
         if largest > OVERSHOOT * output_scale or OVERSHOOT * largest < output_scale / 10:
             raise InputError(

@@ -9,40 +9,40 @@ import json
 import numpy as np
 import pytest
 
+from taichi_unifusion import Frame, PinholeCamera
+from taichi_unifusion.errors import FileError, FrameError, InputError
+from taichi_unifusion.language import feature_image, make_image_encoder, make_text_encoder
+from taichi_unifusion.language.prompts import embed
+from taichi_unifusion.networks import clip
+from taichi_unifusion.networks.tokenizer import _BYTE_LETTERS
+
 torch = pytest.importorskip("torch", reason="needs torch: pip install 'taichi-unifusion[clip]'")
 transformers = pytest.importorskip(
     "transformers", reason="needs transformers: pip install 'taichi-unifusion[clip]'"
 )
 
-from taichi_unifusion import Frame, PinholeCamera  # noqa: E402
-from taichi_unifusion.errors import FileError, FrameError, InputError  # noqa: E402
-from taichi_unifusion.language import feature_image, make_image_encoder, make_text_encoder
-from taichi_unifusion.language.prompts import embed  # noqa: E402
-from taichi_unifusion.networks import clip
-from taichi_unifusion.networks.tokenizer import _BYTE_LETTERS  # noqa: E402
-
 UNIT = 1e-5
 BATCHED = 1e-4  # sums in another order
 PATCH = 8
-TEXT = dict(
-    hidden_size=32,
-    intermediate_size=48,
-    num_hidden_layers=2,
-    num_attention_heads=2,
-    vocab_size=600,
-    max_position_embeddings=20,
-    bos_token_id=1,
-    eos_token_id=2,
-    pad_token_id=2,
-)
-VISION = dict(
-    hidden_size=32,
-    intermediate_size=48,
-    num_hidden_layers=3,
-    num_attention_heads=2,
-    image_size=64,
-    patch_size=PATCH,
-)
+TEXT = {
+    "hidden_size": 32,
+    "intermediate_size": 48,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 2,
+    "vocab_size": 600,
+    "max_position_embeddings": 20,
+    "bos_token_id": 1,
+    "eos_token_id": 2,
+    "pad_token_id": 2,
+}
+VISION = {
+    "hidden_size": 32,
+    "intermediate_size": 48,
+    "num_hidden_layers": 3,
+    "num_attention_heads": 2,
+    "image_size": 64,
+    "patch_size": PATCH,
+}
 
 
 def save_tokenizer(folder) -> None:
@@ -138,7 +138,7 @@ def test_a_batch_gives_what_each_gives_alone(folder):
         ).max()
         < BATCHED
     )
-    images = np.stack([model.normalized(picture(seed), 64, 48) for seed in range(3)])
+    images = np.stack([model.prepared(picture(seed), (64, 48)) for seed in range(3)])
     assert (
         np.abs(model.dense_features(images)[1] - model.dense_features(images[1:2])[0]).max()
         < BATCHED
@@ -159,7 +159,7 @@ def test_a_pooled_dense_network_knows_its_own_head(folder):
     model = make_text_encoder(f"clip:{folder}", device="cpu")
     if model.kind != "siglip":
         pytest.skip("CLIP pools at a token of its own")
-    image = model.normalized(picture(), PATCH, PATCH)[None]
+    image = model.prepared(picture(), (PATCH, PATCH))[None]
     dense = model.dense_features(image)
     with torch.inference_mode():
         pooled = model.model.vision_model(

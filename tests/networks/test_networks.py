@@ -19,7 +19,7 @@ from tiny_networks import (
 
 from taichi_unifusion import Frame, PinholeCamera
 from taichi_unifusion.errors import FileError, FrameError, InputError, MissingDependency
-from taichi_unifusion.networks.image_network import IMAGENET_MEAN, IMAGENET_STD
+from taichi_unifusion.networks.image_input import IMAGENET_MEAN, IMAGENET_STD
 from taichi_unifusion.properties import make_property
 
 pytest.importorskip("onnxruntime", reason="networks are run by onnxruntime, extra 'models'")

@@ -145,8 +145,14 @@ def test_what_is_no_encoder_is_said(tmp_path, merges):
     for make, where, options, error, message in (
         (make_image_encoder, "absent.onnx", {}, FileError, "no such file"),
         (make_image_encoder, "broken.onnx", {}, FileError, "not an ONNX model"),
-        (make_image_encoder, "text.onnx", {}, InputError, "not one image"),
-        (make_image_encoder, "image.onnx", {"size": (32, 32)}, InputError, "64x48"),
+        (make_image_encoder, "text.onnx", {}, InputError, "not one RGB image"),
+        (
+            make_image_encoder,
+            "image.onnx",
+            {"size": (32, 32)},
+            InputError,
+            r"48, 64\].* size=32x32 does not fit",
+        ),
         (make_text_encoder, "image.onnx", {"tokenizer": merges}, InputError, "not token numbers"),
         (make_text_encoder, "text.onnx", {}, InputError, "--tokenizer"),
     ):
