@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.poses import Pose
+from ..files.trajectories import Pose
 from ..types import PinholeCamera
 
 MIN_IDENTITIES = 3  # the first frame often is the origin; more of them mean that nobody tracked

@@ -14,28 +14,20 @@ row of 16 numbers for every frame, in their order.
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from ..files.poses import (
-    Pose,
-    TumRow,
-    finite_or_none,
-    matrix_from_row,
-    read_lines,
-    read_matrix_file,
-    split_row,
-    tum_row,
-)
+from ..files.frame_files import files_by_stem, in_order, list_names
+from ..files.text_rows import finite_or_none
+from ..files.trajectories import REPLICA, TUM, Pose, PoseRow, read_pose_file, read_pose_rows
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..types import PinholeCamera
 from .camera_yaml import CameraFile, read_camera_yaml
 from .intrinsics import check_size
-from .listing import list_names
 from .recording import FrameFiles, Recording, depth_size
 
 DEPTH_SUFFIXES, COLOR_SUFFIXES, INFRARED_SUFFIXES = (
@@ -88,21 +80,6 @@ def open_folder(
     )
 
 
-def in_order(stems: Iterable[str]) -> list[str]:
-    """File stems as people count: by value if all are numbers (time stamps), else with the numbers
-    in them by value.
-    """
-    stems = list(stems)
-    if all(finite_or_none(stem) is not None for stem in stems):
-        return sorted(stems, key=lambda stem: (float(stem), stem))
-    return sorted(
-        stems,
-        key=lambda stem: [
-            int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", stem))
-        ],
-    )
-
-
 def _settings(path: Path, camera: PinholeCamera | None) -> CameraFile:
     """camera.yaml; a caller's camera may stand in for it, but a file that is there must be right."""
     file = path / CAMERA_FILE
@@ -114,20 +91,7 @@ def _settings(path: Path, camera: PinholeCamera | None) -> CameraFile:
 
 def _images(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
     """Stem -> file of the images in `folder`; none if there is no such folder."""
-    if not folder.exists():
-        return {}
-    files = [
-        folder / name
-        for name in list_names(folder)
-        if name.lower().endswith(tuple(suffixes)) and name[0] != "."
-    ]
-    found = {file.stem: file for file in files}
-    if len(found) < len(files):
-        twice = next(file for file in files if found[file.stem] != file)
-        raise DatasetError(
-            f"{folder}: {twice.name} and {found[twice.stem].name} are two images of one name, keep one"
-        )
-    return found
+    return files_by_stem(folder, suffixes) if folder.exists() else {}
 
 
 def _file_of(stem: str, files: dict[str, Path]) -> Path:
@@ -154,46 +118,36 @@ def _read_poses(
     if source is None:
         return [None] * len(stems)
     if os.path.isdir(source):  # unlike Path.is_dir it answers for any name
-        return [read_matrix_file(source / f"{stem}.txt") for stem in stems]
-    rows = [(split_row(line), f"{source} line {number}") for number, line in read_lines(source)]
-    if not rows:
-        raise DatasetError(f"{source}: holds no poses")
-    columns, first = len(rows[0][0]), rows[0][1]
-    if columns == 8:
-        return _named_poses([tum_row(*row) for row in rows], source, stems, max_difference)
-    if columns != 16:
-        raise DatasetError(
-            f"{first}: expected 8 columns (name tx ty tz qx qy qz qw) or 16 (a 4x4 matrix), found {columns}"
-        )
+        return [read_pose_file(source / f"{stem}.txt") for stem in stems]
+    rows = read_pose_rows(source, (TUM, REPLICA))
+    if rows[0].name:
+        return [*_named_poses(rows, source, stems, max_difference)]
     if len(rows) != len(stems):
         raise DatasetError(
             f"{source}: {len(rows)} rows for {len(stems)} frames; rows of 16 numbers bear no names, so every "
             "frame needs one; else write rows of 'name tx ty tz qx qy qz qw'"
         )
-    return [matrix_from_row(*row) for row in rows]
+    return [row.pose for row in rows]
 
 
 def _named_poses(
-    rows: Sequence[TumRow], source: Path, stems: Sequence[str], max_difference: float
+    rows: Sequence[PoseRow], source: Path, stems: Sequence[str], max_difference: float
 ) -> list[Pose]:
     """For every stem the row of that name, else the row nearest in time if the stem is a number."""
-    by_name: dict[str, TumRow] = {}
+    by_name: dict[str, PoseRow] = {}
     for row in rows:
         if by_name.setdefault(row.name, row) is not row:
             raise DatasetError(
-                f"{row.source}: '{row.name}' appears again (first: {by_name[row.name].source}), keep one"
+                f"{row.pose.source}: '{row.name}' appears again (first: {by_name[row.name].pose.source}), keep one"
             )
-    timed = sorted(
-        (row for row in rows if row.timestamp is not None), key=lambda row: row.timestamp
-    )
-    times = np.array([row.timestamp for row in timed])
+    times, timed = _timed(rows)
 
-    def find(stem: str) -> TumRow | None:
+    def find(stem: str) -> PoseRow | None:
         time = finite_or_none(stem)
         if stem in by_name or time is None or not timed:
             return by_name.get(stem)
-        row = timed[int(nearest(times, np.array([time]))[0])]
-        return row if abs(row.timestamp - time) <= max_difference else None
+        at = int(nearest(times, np.array([time]))[0])
+        return timed[at] if abs(times[at] - time) <= max_difference else None
 
     found = [find(stem) for stem in stems]
     if not any(found):
@@ -205,6 +159,13 @@ def _named_poses(
         f"no row for it (its name in the first column, or a time stamp within {max_difference} s)"
     )
     return [
-        row.pose() if row else Pose(f"{source} frame {stem}", problem=nothing)
+        row.pose if row else Pose(f"{source} frame {stem}", problem=nothing)
         for stem, row in zip(stems, found, strict=True)
     ]
+
+
+def _timed(rows: Sequence[PoseRow]) -> tuple[NDArray[np.float64], list[PoseRow]]:
+    """Time stamps [s], ascending, and the rows that have one."""
+    pairs = [(row.timestamp, row) for row in rows if row.timestamp is not None]
+    pairs.sort(key=lambda pair: pair[0])
+    return np.array([time for time, _ in pairs]), [row for _, row in pairs]

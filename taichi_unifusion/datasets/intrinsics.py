@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DatasetError, InputError
-from ..files.poses import parse_numbers, read_lines, split_row
+from ..files.text_rows import parse_numbers, read_lines, split_row
 from ..types import PinholeCamera
 
 

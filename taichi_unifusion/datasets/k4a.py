@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..errors import DatasetError, FrameError, MissingDependency, check_choice
 from ..files.images import decode_color, depth_to_metres
-from ..files.poses import Pose, read_tum_rows
+from ..files.trajectories import Pose, read_stamped_poses
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..types import Frame
 from .base import Dataset
@@ -244,15 +244,13 @@ def _read_poses(file: Path, times: NDArray[np.float64], max_difference: float) -
     """
     if not file.exists():
         return [Pose("first frame", np.eye(4)), *(Pose(f"no {file.name}") for _ in times[1:])]
-    rows = sorted(read_tum_rows(file), key=lambda row: row.timestamp)
-    if not rows:
-        raise DatasetError(f"{file}: holds no poses")
+    rows = sorted(read_stamped_poses(file), key=lambda row: row.timestamp)
     stamps, nothing = (
         np.array([row.timestamp for row in rows]),
         f"no pose within {max_difference} s of the frame",
     )
     return [
-        rows[i].pose()
+        rows[i].pose
         if abs(stamps[i] - time) <= max_difference
         else Pose(str(file), problem=nothing)
         for i, time in zip(nearest(stamps, times), times, strict=True)

@@ -25,7 +25,7 @@ from ..files.images import (
     resize_color,
     resize_image,
 )
-from ..files.poses import Pose
+from ..files.trajectories import Pose
 from ..types import Frame, PinholeCamera
 from .base import Dataset
 from .checks import camera_warnings, pose_warnings

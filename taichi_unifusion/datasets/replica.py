@@ -15,10 +15,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import DatasetError
-from ..files.poses import Pose, read_matrix_rows
+from ..files.frame_files import file_of, first_existing, numbered_files
+from ..files.trajectories import REPLICA, Pose, read_pose_rows
 from ..types import PinholeCamera
 from .intrinsics import check_size, make_camera
-from .listing import file_of, first_existing, numbered_files
 from .recording import FrameFiles, Recording, check_depth_scale, depth_size
 
 DEPTH_SCALE = 6553.5
@@ -70,9 +70,9 @@ def open_replica(
 
 def _read_poses(numbers: Sequence[int], trajectory: Path) -> tuple[list[Pose], list[str]]:
     """The pose of every frame number, ascending, and a warning where the trajectory holds more."""
-    rows = read_matrix_rows(trajectory)
+    rows = read_pose_rows(trajectory, (REPLICA,))
     poses = [
-        rows[number]
+        rows[number].pose
         if number < len(rows)
         else Pose(
             str(trajectory),

@@ -15,10 +15,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import DatasetError
-from ..files.poses import parse_numbers, read_lines, read_matrix_file
+from ..files.frame_files import file_of, first_existing, list_names, numbered_files
+from ..files.text_rows import parse_numbers, read_lines
+from ..files.trajectories import read_pose_file
 from ..types import PinholeCamera
 from .intrinsics import check_size, make_camera, read_matrix_camera
-from .listing import file_of, first_existing, list_names, numbered_files
 from .recording import FrameFiles, Recording, check_depth_scale, depth_size
 from .sens import SensFile
 from .seven_scenes import flat_frames, no_flat_poses
@@ -68,7 +69,7 @@ def _open_extracted(
         FrameFiles(
             file_of(number, depth, path / "depth", "{}.png"),
             file_of(number, color, path / "color", "{}.jpg"),
-            read_matrix_file(file_of(number, pose, path / "pose", "{}.txt")) if pose else None,
+            read_pose_file(file_of(number, pose, path / "pose", "{}.txt")) if pose else None,
             infrared=infrared.get(number),
         )
         for number in sorted({*depth, *color, *pose})

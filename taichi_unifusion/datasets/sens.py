@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..errors import DatasetError, FrameError
 from ..files.image_headers import MAX_PIXELS
 from ..files.images import INVALID_DEPTH, decode_color, depth_to_metres, resize_color
-from ..files.poses import Pose
+from ..files.trajectories import Pose
 from ..types import Frame, PinholeCamera
 from .base import Dataset
 from .checks import camera_warnings, pose_warnings

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import DatasetError
-from ..files.poses import read_matrix_file
+from ..files.frame_files import file_of, first_existing, list_names, numbered_files
+from ..files.trajectories import read_pose_file
 from ..types import PinholeCamera
 from .intrinsics import check_size, make_camera, read_matrix_camera
-from .listing import file_of, first_existing, list_names, numbered_files
 from .recording import FrameFiles, Recording, depth_size
 
 DEPTH_SCALE = 1000.0
@@ -61,7 +61,7 @@ def flat_frames(folder: Path, depth_suffix: str = "png") -> list[FrameFiles]:
         FrameFiles(
             file_of(number, depth, folder, "frame-{:06d}.depth.png"),
             file_of(number, color, folder, "frame-{:06d}.color.png"),
-            read_matrix_file(file_of(number, pose, folder, "frame-{:06d}.pose.txt"))
+            read_pose_file(file_of(number, pose, folder, "frame-{:06d}.pose.txt"))
             if pose
             else None,
         )

@@ -14,15 +14,18 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from ..files.poses import Pose, TumRow, finite_or_none, read_lines, read_tum_rows
+from ..files.frame_files import list_names
+from ..files.text_rows import finite_or_none, read_lines
+from ..files.trajectories import Pose, read_stamped_poses
 from ..geometry.time_stamps import associate, check_max_difference, nearest
 from ..types import PinholeCamera
 from .intrinsics import check_size
-from .listing import list_names
 from .recording import FrameFiles, Recording, depth_size
 
 DEPTH_SCALE = 5000.0
@@ -33,16 +36,17 @@ CAMERAS = {  # published calibration of the three Kinects
     "freiburg3": PinholeCamera(640, 480, 535.4, 539.2, 320.1, 247.6),
 }
 ROS_CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
+Item = TypeVar("Item")
 SENSOR_IN_NAME = re.compile(r"(?:^|[^a-z])fr(?:eiburg)?([123])", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Stamped:
+class Stamped(Generic[Item]):
     """Something with a time stamp [s]: an image's file or a pose, and the line it stands in."""
 
     timestamp: float
     line: str
-    value: Path | TumRow
+    value: Item
 
 
 def open_tum(
@@ -99,10 +103,10 @@ def open_tum(
     )
 
 
-def _read_image_list(file: Path) -> list[Stamped]:
+def _read_image_list(file: Path) -> list[Stamped[Path]]:
     images = []
     for number, line in read_lines(file):
-        where, words = f"{file} line {number}", line.split(maxsplit=1)
+        where, words = f"{file}, line {number}", line.split(maxsplit=1)
         timestamp = finite_or_none(words[0])
         if timestamp is None or len(words) < 2:
             raise DatasetError(f"{where}: expected 'timestamp filename', found '{line[:60]}'")
@@ -112,9 +116,9 @@ def _read_image_list(file: Path) -> list[Stamped]:
     return images
 
 
-def _in_time_order(items: Sequence[Stamped], warnings: list[str]) -> list[Stamped]:
+def _in_time_order(items: Sequence[Stamped[Item]], warnings: list[str]) -> list[Stamped[Item]]:
     """Sorted by time stamp; of equal stamps the first counts, the others are left out and said."""
-    kept: dict[float, Stamped] = {}
+    kept: dict[float, Stamped[Item]] = {}
     for item in items:
         kept.setdefault(item.timestamp, item)
     if len(kept) < len(items):
@@ -126,24 +130,23 @@ def _in_time_order(items: Sequence[Stamped], warnings: list[str]) -> list[Stampe
     return sorted(kept.values(), key=lambda item: item.timestamp)
 
 
-def _stamps(items: Sequence[Stamped]) -> np.ndarray:
+def _stamps(items: Sequence[Stamped[Any]]) -> NDArray[np.float64]:
     return np.array([item.timestamp for item in items])
 
 
 def _poses_for(
-    depth: Sequence[Stamped], file: Path, max_difference: float, warnings: list[str]
+    depth: Sequence[Stamped[Path]], file: Path, max_difference: float, warnings: list[str]
 ) -> list[Pose]:
     """The ground truth nearest to each depth image, or why there is none."""
     truth = _in_time_order(
-        [Stamped(row.timestamp, row.source, row) for row in read_tum_rows(file)], warnings
+        [Stamped(row.timestamp, row.pose.source, row.pose) for row in read_stamped_poses(file)],
+        warnings,
     )
-    if not truth:
-        raise DatasetError(f"{file}: holds no poses")
     poses = []
     for image, found in zip(depth, nearest(_stamps(truth), _stamps(depth)), strict=True):
         gap = abs(truth[found].timestamp - image.timestamp)
         poses.append(
-            truth[found].value.pose()
+            truth[found].value
             if gap <= max_difference
             else Pose(
                 str(file),

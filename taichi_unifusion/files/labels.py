@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, InputError
+from ..errors import DatasetError, FileError, InputError
 from .atomic import read_bytes
 from .mesh_reading import read_mesh
+from .text_rows import parse_lines
 
 SUFFIXES = (".ply", ".txt", ".npy")
 
@@ -107,10 +108,7 @@ def _parse_text(path: Path) -> NDArray[np.float64]:
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Number and text of the lines that are neither empty nor comments."""
     try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise FileError(f"{path}: not a text file") from None
-    stripped = (
-        (number, " ".join(line.split())) for number, line in enumerate(text.splitlines(), start=1)
-    )
-    return [(number, line) for number, line in stripped if line and not line.startswith("#")]
+        lines = list(parse_lines(read_bytes(path), str(path)))
+    except DatasetError as error:
+        raise FileError(str(error)) from None
+    return [(number, " ".join(line.split())) for number, line in lines]

@@ -193,10 +193,10 @@ def _read_element(
     values_of = {key: list(table[key]) if key in lists else [table[key]] for key in numbers + lists}
     # from the first row that differs, or where the file ends, one by one
     for _ in range(len(table), element.rows):
-        end = offset
-        for p, values, end in _read_row(body, offset, element, order, name):
+        row_values = list(_read_row(body, offset, element, order, name))
+        for p, values, _ in row_values:
             values_of[p.name].append(values)
-        offset = end
+        offset = row_values[-1][2]
     return _Columns(
         {k: np.concatenate(values_of[k]) for k in numbers}, {k: values_of[k] for k in lists}
     ), offset

@@ -1,22 +1,129 @@
-"""Trajectories in TUM's format, written and read."""
+"""Camera poses as text, camera to world in metres: TUM, KITTI, Replica, or one matrix a file.
+
+One reader for all of them. Columns are separated by blanks or commas; comments, empty lines, a
+byte-order mark and any line end are accepted; the first row decides how many columns all have.
+What is not a row of numbers is a DatasetError with its line. A pose that cannot be used (not
+finite, not rigid, a quaternion whose length is not 1 within UNIT_TOLERANCE) is kept with the
+reason, so that it costs its own frame only. Rows keep the order of the file: who joins them to
+frames by time stamp takes the first of equal stamps.
+"""
 
 from __future__ import annotations
 
-import math
 import os
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..errors import DatasetError
+from ..errors import DatasetError, PoseError
 from ..geometry.quaternions import quaternion_to_rotation, rotation_to_quaternion
 from ..types import Trajectory, check_rigid
 from .atomic import atomic_write, read_bytes
+from .text_rows import finite_or_none, parse_lines, parse_numbers, read_lines, split_row
 
-# | |q| - 1 | of a quaternion in a file: 4 printed digits pass, a wrong column does not
+# of a quaternion's length: four printed digits pass, a wrong column does not
 UNIT_TOLERANCE = 1e-3
+TUM, KITTI, REPLICA = 8, 12, 16  # columns
+ROWS = {
+    TUM: "timestamp tx ty tz qx qy qz qw",
+    KITTI: "the first 3 rows of a 4x4 matrix",
+    REPLICA: "a 4x4 matrix",
+}
 
 
-def write_trajectory(path: str | os.PathLike, trajectory: Trajectory) -> None:
+@dataclass(frozen=True)
+class Pose:
+    """A pose as found in a file: the matrix, not yet known to be rigid, or why there is none."""
+
+    source: str  # file and line, for messages
+    T_world_camera: NDArray[np.float64] | None = None  # (4, 4)
+    problem: str = ""  # why T_world_camera is None
+
+    def checked(self) -> NDArray[np.float64]:
+        """T_world_camera as a rigid transform, or PoseError naming the source."""
+        if self.T_world_camera is None:
+            raise PoseError(f"{self.source}: {self.problem}")
+        return check_rigid(self.T_world_camera, self.source)
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """A row of a trajectory file: its pose and, in TUM's format, whose it is."""
+
+    pose: Pose
+    name: str = ""  # first column of a TUM row: a time stamp, or the name of a frame
+
+    @property
+    def timestamp(self) -> float | None:
+        """The name as a time stamp [s], if it is a finite number."""
+        return finite_or_none(self.name)
+
+
+@dataclass(frozen=True)
+class StampedPose:
+    """A pose and its time stamp [s]."""
+
+    timestamp: float
+    pose: Pose
+
+
+def read_pose_rows(path: Path, columns: Collection[int] = tuple(ROWS)) -> list[PoseRow]:
+    """The rows of a trajectory file with one of these numbers of columns.
+
+    Raises DatasetError where the file cannot be read, holds no rows, or a row has another number
+    of columns.
+    """
+    return _parse_pose_rows(list(read_lines(path)), str(path), columns)
+
+
+def read_stamped_poses(path: Path) -> list[StampedPose]:
+    """TUM rows, as `read_pose_rows`; DatasetError too where a first column is no time stamp."""
+    return stamped(read_pose_rows(path, (TUM,)))
+
+
+def stamped(rows: Sequence[PoseRow]) -> list[StampedPose]:
+    """The rows with their time stamps, or DatasetError for the first that has none."""
+    poses = []
+    for row in rows:
+        timestamp = row.timestamp
+        if timestamp is None:
+            raise DatasetError(f"{row.pose.source}: '{row.name}' is not a time stamp")
+        poses.append(StampedPose(timestamp, row.pose))
+    return poses
+
+
+def read_pose_file(path: Path) -> Pose:
+    """The row-major 4x4 matrix that fills the file; whatever is wrong with it stays with this pose."""
+    if not os.path.exists(path):  # unlike Path.exists it answers for any name
+        return Pose(str(path), problem="no such file, this frame has no pose")
+    try:
+        words = [word for _, line in read_lines(path) for word in split_row(line)]
+        numbers = parse_numbers(words, str(path))
+    except DatasetError as error:
+        return Pose(str(path), problem=f"not a pose file ({str(error).removeprefix(f'{path}: ')})")
+    if len(numbers) != REPLICA:
+        return Pose(str(path), problem=f"expected a 4x4 matrix, found {len(numbers)} numbers")
+    return Pose(str(path), np.array(numbers).reshape(4, 4))
+
+
+def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+    """Read camera-to-world poses in TUM's format, in time order; every pose must be usable.
+
+    Raises FileError where the file is missing, DatasetError, with the line, where it does not hold
+    poses, PoseError for one that is not rigid.
+    """
+    lines = list(parse_lines(read_bytes(path), str(path)))
+    rows = stamped(_parse_pose_rows(lines, str(path), (TUM,)))
+    rows.sort(key=lambda row: row.timestamp)
+    return Trajectory(
+        np.array([row.timestamp for row in rows]), np.array([row.pose.checked() for row in rows])
+    )
+
+
+def write_trajectory(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
     """Write camera-to-world poses atomically in TUM's format: `timestamp tx ty tz qx qy qz qw`,
     seconds and metres.
 
@@ -27,7 +134,7 @@ def write_trajectory(path: str | os.PathLike, trajectory: Trajectory) -> None:
     for i, T_world_camera in enumerate(trajectory.T_world_camera):
         poses[i] = check_rigid(T_world_camera, f"{path}: pose {i}")
     rows = np.hstack([poses[:, :3, 3], rotation_to_quaternion(poses[:, :3, :3])])
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    lines = [f"# {ROWS[TUM]}"]
     # 9 digits: a nanometre; time stamps without loss
     for timestamp, row in zip(trajectory.timestamps, rows, strict=True):
         lines.append(" ".join([repr(float(timestamp)), *(f"{value:.9f}" for value in row)]))
@@ -35,49 +142,58 @@ def write_trajectory(path: str | os.PathLike, trajectory: Trajectory) -> None:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def read_trajectory(path: str | os.PathLike) -> Trajectory:
-    """Read camera-to-world poses in TUM's format, in time order; comments, BOM and CRLF are fine.
-
-    Raises FileError where the file is missing, DatasetError, with the line, where it does not hold
-    poses.
-    """
-    try:
-        text = read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise DatasetError(
-            f"{path}: not a text file; expected lines 'timestamp tx ty tz qx qy qz qw'"
-        ) from None
-    rows = [
-        _parse_pose(line, f"{path}, line {number}")
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not rows:
-        raise DatasetError(
-            f"{path}: holds no poses; expected lines 'timestamp tx ty tz qx qy qz qw'"
-        )
-    table = np.array(rows)
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    T_world_camera = np.tile(np.eye(4), (len(table), 1, 1))
-    T_world_camera[:, :3, :3] = quaternion_to_rotation(table[:, 4:])
-    T_world_camera[:, :3, 3] = table[:, 1:4]
-    return Trajectory(table[:, 0].copy(), T_world_camera)
+def _parse_pose_rows(
+    lines: Sequence[tuple[int, str]], path: str, columns: Collection[int]
+) -> list[PoseRow]:
+    """The rows of the numbered lines, which all have as many columns as the first."""
+    if not lines:
+        raise DatasetError(f"{path}: holds no poses; expected rows of {_expected(columns)}")
+    sources = [f"{path}, line {number}" for number, _ in lines]
+    words = [split_row(line) for _, line in lines]
+    allowed = columns
+    for row, source in zip(words, sources, strict=True):
+        if len(row) not in allowed:
+            raise DatasetError(f"{source}: expected {_expected(allowed)}, found {len(row)}")
+        allowed = (len(row),)
+    named = len(words[0]) == TUM
+    names = [row[0] if named else "" for row in words]
+    numbers = np.array(
+        [parse_numbers(row[named:], source) for row, source in zip(words, sources, strict=True)]
+    )
+    poses = _from_tum(numbers, sources) if named else _from_matrices(numbers, sources)
+    return [PoseRow(pose, name) for pose, name in zip(poses, names, strict=True)]
 
 
-def _parse_pose(line: str, at: str) -> list[float]:
-    """The 8 numbers of one line, or DatasetError."""
-    words = line.split()
-    try:
-        row = [float(word) for word in words]
-    except ValueError:
-        raise DatasetError(f"{at}: expected 8 numbers, got '{line.strip()[:80]}'") from None
-    if len(row) != 8 or not all(map(math.isfinite, row)):
-        raise DatasetError(
-            f"{at}: expected 8 finite numbers 'timestamp tx ty tz qx qy qz qw', got '{line.strip()[:80]}'"
-        )
-    length = math.hypot(*row[4:])
-    if abs(length - 1) > UNIT_TOLERANCE:
-        raise DatasetError(
-            f"{at}: the quaternion has length {length:.4f}, not 1; are the columns qx qy qz qw?"
-        )
-    return row
+def _expected(columns: Collection[int]) -> str:
+    return " or ".join(f"{count} columns ({ROWS[count]})" for count in columns)
+
+
+def _from_tum(numbers: NDArray[np.float64], sources: Sequence[str]) -> list[Pose]:
+    """Poses of rows tx ty tz qx qy qz qw, (N, 7)."""
+    lengths = np.linalg.norm(numbers[:, 3:], axis=1)
+    usable = np.isfinite(numbers).all(axis=1) & (np.abs(lengths - 1) <= UNIT_TOLERANCE)
+    T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
+    T_world_camera[usable, :3, :3] = quaternion_to_rotation(numbers[usable, 3:])
+    T_world_camera[:, :3, 3] = numbers[:, :3]
+    poses = []
+    for T, length, good, source in zip(T_world_camera, lengths, usable, sources, strict=True):
+        if good:
+            poses.append(Pose(source, T))
+        elif not np.isfinite(length) or not np.isfinite(T).all():
+            poses.append(Pose(source, problem="holds NaN or infinite numbers"))
+        else:
+            poses.append(
+                Pose(
+                    source,
+                    problem=f"the quaternion's length is {length:.4f}, not 1; are the columns "
+                    "tx ty tz qx qy qz qw?",
+                )
+            )
+    return poses
+
+
+def _from_matrices(numbers: NDArray[np.float64], sources: Sequence[str]) -> list[Pose]:
+    """Poses of row-major 4x4 matrices, (N, 16), or of their first three rows, (N, 12)."""
+    T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))
+    T_world_camera[:, : numbers.shape[1] // 4] = numbers.reshape(len(numbers), -1, 4)
+    return [Pose(source, T) for T, source in zip(T_world_camera, sources, strict=True)]

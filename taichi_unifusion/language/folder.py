@@ -4,7 +4,6 @@ way.
 
 from __future__ import annotations
 
-import re
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
+from ..files.frame_files import FrameFolder, files_by_stem
 from ..networks.encoders import unit_length
 from ..types import Frame
 
@@ -24,7 +24,6 @@ LONGEST_SIDE = 96  # pixels of a feature image; more only repeats what the netwo
 # of image-text networks, to tell (h, w, c) from (c, h, w)
 USUAL_CHANNELS = (512, 640, 768, 1024, 1152, 1280)
 MAX_SIDE, MAX_CHANNELS = 16384, 8192
-NUMBERS = re.compile(r"\d+")
 
 
 @dataclass(frozen=True)
@@ -32,29 +31,20 @@ class FolderFeatures:
     """Features of frames by the frame's file name, or by its number."""
 
     name: str
-    files: dict[str, Path]  # by stem
+    files: FrameFolder
     layout: Literal["auto", "hwc", "chw"] = "auto"
 
     def image_features(self, frame: Frame) -> NDArray[np.float32]:
         """(h, w, c) unit length, no larger than LONGEST_SIDE; raises FrameError where there is no
         file or it is damaged.
         """
-        stem = Path(frame.name).stem
-        path = self.files.get(stem) or self._by_number(stem, frame.index)
+        path = self.files.file_of(frame.name, frame.index)
         if path is None:
             raise FrameError(f"{self.name}: has no features for {frame.label}")
         try:
             return unit_length(read_features(path, self.layout))
         except (FileError, InputError) as error:
             raise FrameError(str(error)) from error
-
-    def _by_number(self, stem: str, index: int) -> Path | None:
-        found = NUMBERS.findall(stem)
-        wanted = int(found[-1]) if found else index
-        numbered = ((NUMBERS.findall(other), path) for other, path in self.files.items())
-        return next(
-            (path for numbers, path in numbered if numbers and int(numbers[-1]) == wanted), None
-        )
 
 
 def folder_features(
@@ -65,10 +55,10 @@ def folder_features(
     check_choice("layout", layout, ("auto", "hwc", "chw"))
     if not folder.is_dir():
         raise FileError(f"{folder}: no such folder")
-    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix in SUFFIXES}
+    files = files_by_stem(folder, SUFFIXES)
     if not files:
         raise FileError(f"{folder}: no *{', *'.join(SUFFIXES)} here")
-    return FolderFeatures(str(folder), files, layout)
+    return FolderFeatures(str(folder), FrameFolder(folder, files), layout)
 
 
 def read_features(path: Path, layout: str = "auto") -> NDArray[np.float32]:
@@ -187,7 +177,7 @@ def _open_torch(path: Path):
         raise FileNotFoundError
     try:
         array = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # torch has a class of its own for every kind
+    except Exception as error:  # noqa: BLE001 - torch has a class of its own for every kind
         line = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
         raise FileError(
             f"{path}: not a tensor that torch reads safely, without running code ({line})"

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.listing import list_names
 from ..errors import FrameError, InputError
+from ..files.frame_files import FrameFolder, files_by_stem
 from ..files.images import read_values
 from ..rendering.look import Look
 from ..types import Frame
 from .base import SurfaceProperty
 
 SUFFIXES = (".npy", ".png", ".jpg", ".jpeg")
-NUMBERS = re.compile(r"\d+")
 
 
 def folder_images(
@@ -29,21 +27,16 @@ def folder_images(
     `frame-000017.depth.png`). All have the channels of the first. Values from `low` to `high` are
     coloured; without these, where most lie.
     """
-    files = {
-        Path(name).stem: file / name
-        for name in list_names(file)
-        if Path(name).suffix.lower() in SUFFIXES
-    }
+    files = files_by_stem(file, SUFFIXES)
     if not files:
         raise InputError(f"{file}: no *{', *'.join(SUFFIXES)} here")
-    numbers = {_number(stem): path for stem, path in files.items()}
+    folder = FrameFolder(file, files)
     channels = read_values(next(iter(files.values()))).shape[2]
     if (low is None) != (high is None):
         raise InputError("images: give both low and high, or none of them")
 
     def function(frame: Frame) -> NDArray[np.float32]:
-        stem = Path(frame.name).stem
-        path = files.get(stem) or numbers.get(_number(stem) if frame.name else frame.index)
+        path = folder.file_of(frame.name, frame.index)
         if path is None:
             raise FrameError(f"{file} holds no image of that name or number")
         values = read_values(path)
@@ -55,9 +48,3 @@ def folder_images(
 
     look = Look(colormap, None if low is None or high is None else (low, high), file.name)
     return SurfaceProperty("images", channels, function, look)
-
-
-def _number(stem: str) -> int | None:
-    """The last number in a name."""
-    found = NUMBERS.findall(stem)
-    return int(found[-1]) if found else None

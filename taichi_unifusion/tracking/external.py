@@ -4,14 +4,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
+from ..files.frame_files import number_of
 from ..geometry import se3
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..types import Frame
@@ -19,8 +18,6 @@ from .base import TrackedFrame, Tracker, TrackingResult, Verdict
 from .trajectory_files import ExternalPoses
 
 MAX_DIFFERENCE = 0.02  # [s] between a frame and its pose, as TUM's benchmark has it
-# names of images with the frame's number
-NUMBERED = r"[A-Za-z_-]*(\d+)(?:\.(?:color|depth))?\.[A-Za-z]+"
 # [s] or frames; a longer gap is not interpolated: nobody knows what the camera did in it
 LONGEST_GAP = 1.0, 30.0
 
@@ -84,8 +81,8 @@ class ExternalPoseTracker(Tracker):
         """A frame's number as the poses have it: in the name of its image, or its place in the
         recording.
         """
-        named = self.poses.by_name and re.fullmatch(NUMBERED, Path(frame.name).name)
-        return int(named[1]) if named else frame.index
+        number = number_of(frame.name) if self.poses.by_name else None
+        return frame.index if number is None else number
 
     def skip(self, index: int, error: Exception) -> TrackedFrame:
         self.frames.append(super().skip(index, error))

@@ -8,7 +8,6 @@ their names.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,15 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.listing import list_names
 from ..errors import DatasetError, PoseError
-from ..files.poses import Pose, matrix_from_row, read_lines, read_matrix_file, split_row, tum_row
-
-FORMATS = {
-    8: "TUM (timestamp tx ty tz qx qy qz qw)",
-    12: "KITTI (the first 3 rows of a 4x4 matrix)",
-    16: "Replica (a 4x4 matrix)",
-}  # by the number of columns
+from ..files.frame_files import list_names, number_of
+from ..files.trajectories import Pose, read_pose_file, read_pose_rows, stamped
 
 
 @dataclass(frozen=True)
@@ -51,47 +44,21 @@ def read_poses(path: str | Path) -> ExternalPoses:
     path = Path(path).expanduser()
     if path.is_dir():
         poses = _checked(
-            path, False, [(number, read_matrix_file(file)) for number, file in _numbered(path)]
+            path, False, [(number, read_pose_file(file)) for number, file in _numbered(path)]
         )
         return replace(poses, by_name=True)
-    rows = [(split_row(line), f"{path} line {number}") for number, line in read_lines(path)]
-    if not rows:
-        raise DatasetError(f"{path}: holds no poses")
-    columns, where = len(rows[0][0]), rows[0][1]
-    if columns == 8:
-        stamped = [tum_row(*row) for row in rows]
-        for row in stamped:
-            if row.timestamp is None:
-                raise DatasetError(f"{row.source}: '{row.name}' is not a time stamp")
-        return _checked(path, True, [(row.timestamp, row.pose()) for row in stamped])
-    if columns not in FORMATS:
-        known = ", ".join(f"{count}: {name}" for count, name in FORMATS.items())
-        raise DatasetError(f"{where}: a row has {columns} numbers; known are {known}")
-    last = ["0", "0", "0", "1"] if columns == 12 else []
-    return _checked(
-        path,
-        False,
-        [
-            (number, matrix_from_row(_of_length(words, columns, at) + last, at))
-            for number, (words, at) in enumerate(rows)
-        ],
-    )
-
-
-def _of_length(words: list[str], columns: int, where: str) -> list[str]:
-    if len(words) != columns:
-        raise DatasetError(
-            f"{where}: expected {columns} numbers as in the first row, found {len(words)}"
-        )
-    return words
+    rows = read_pose_rows(path)
+    if rows[0].name:
+        return _checked(path, True, [(row.timestamp, row.pose) for row in stamped(rows)])
+    return _checked(path, False, [(number, row.pose) for number, row in enumerate(rows)])
 
 
 def _numbered(folder: Path) -> list[tuple[int, Path]]:
     """Pose files of a folder with the number in their name: 12.txt, frame-000012.pose.txt."""
     found = [
-        (int(match[1]), folder / name)
+        (number, folder / name)
         for name in list_names(folder)
-        if (match := re.fullmatch(r"(?:[A-Za-z_-]*?)(\d+)(?:\.pose)?\.txt", name))
+        if name.endswith(".txt") and (number := number_of(name)) is not None
     ]
     if not found:
         raise DatasetError(f"{folder}: no N.txt or frame-N.pose.txt here")

@@ -258,7 +258,7 @@ def test_folder_ambiguities_are_refused(tmp_path):
         open_dataset("folder", folder)
     (folder / "camera.yaml").write_text(CAMERA_YAML + "poses: poses.txt\n")
     with pytest.raises(
-        DatasetError, match="poses.txt line 1: expected 8 columns .* or 16 .* found 3"
+        DatasetError, match="poses.txt, line 1: expected 8 columns .* or 16 .* found 3"
     ):
         open_dataset("folder", folder)
     (folder / "poses.txt").write_text("img1 0 0 0 0 0 0 1\nimg1 0 0 0 0 0 0 1\n")
@@ -269,7 +269,7 @@ def test_folder_ambiguities_are_refused(tmp_path):
         open_dataset("folder", folder)
     (folder / "camera.yaml").write_text(CAMERA_YAML + "poses: poses\n")
     write_image(folder / "color" / "000000.jpg", np.zeros((12, 16, 3), np.uint8))
-    with pytest.raises(DatasetError, match="000000.* two images of one name"):
+    with pytest.raises(DatasetError, match="000000.* two files of one name"):
         open_dataset("folder", folder)
 
 

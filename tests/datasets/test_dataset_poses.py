@@ -28,7 +28,7 @@ from dataset_writers import (
 
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.errors import DatasetError, FrameError, InputError, PoseError
-from taichi_unifusion.files.poses import rotation_from_quaternion
+from taichi_unifusion.geometry.quaternions import quaternion_to_rotation
 from taichi_unifusion.geometry.time_stamps import associate, nearest
 
 EXACT = 1e-12  # double arithmetic on numbers near one
@@ -94,7 +94,7 @@ def test_P1_replica_row_with_nan_costs_its_frame(tmp_path):
     samples = make_samples(3)
     samples[1].T_world_camera[0, 0] = np.nan
     dataset = open_dataset("replica", write_replica(tmp_path, samples))
-    with pytest.raises(PoseError, match="traj.txt line 2"):
+    with pytest.raises(PoseError, match="traj.txt, line 2"):
         dataset[1]
     assert dataset[2].depth.any()
 
@@ -132,18 +132,18 @@ def test_P6_quaternion_is_normalised_within_tolerance_only(tmp_path):
         dataset[0].T_world_camera, samples[0].T_world_camera, rtol=0, atol=EXACT
     )
     with pytest.raises(
-        PoseError, match="groundtruth.txt line 2: the quaternion's length is 1.3000"
+        PoseError, match="groundtruth.txt, line 2: the quaternion's length is 1.3000"
     ):
         dataset[1]
     with pytest.raises(PoseError, match="length is 0.0000"):
         dataset[2]
 
 
-def test_rotation_from_quaternion_is_the_textbook_rotation():
+def test_quaternion_to_rotation_is_the_textbook_rotation():
     rng = np.random.default_rng(2)
     for q in rng.normal(size=(20, 4)):
         q /= np.linalg.norm(q)
-        R, v = rotation_from_quaternion(q), rng.normal(size=3)
+        R, v = quaternion_to_rotation(q[None])[0], rng.normal(size=3)
         u, w = q[:3], q[3]
         rotated = 2 * (u @ v) * u + (w * w - u @ u) * v + 2 * w * np.cross(u, v)  # q v q*
         np.testing.assert_allclose(R @ v, rotated, rtol=0, atol=EXACT)
@@ -174,7 +174,7 @@ def test_P7_a_stamp_that_appears_again_is_left_out_and_said(tmp_path):
     assert len(dataset) == 3
     np.testing.assert_array_equal(dataset[1].depth, samples[1].metres(5000.0))
     assert any(
-        "depth.txt line 5" in warning and "appears again" in warning for warning in dataset.warnings
+        "depth.txt, line 5" in warning and "appears again" in warning for warning in dataset.warnings
     )
 
 
@@ -193,7 +193,7 @@ def test_P7_a_row_that_cannot_be_read_is_named(tmp_path, name, line, said):
     folder = write_tum(tmp_path, make_samples(4))
     with open(folder / name, "a") as file:
         file.write(line)
-    with pytest.raises(DatasetError, match=f"{name} {said}"):
+    with pytest.raises(DatasetError, match=f"{name}, {said}"):
         open_dataset("tum", folder, camera=CAMERA)
 
 
@@ -214,7 +214,7 @@ def test_P7_replica_row_of_another_length_is_named(tmp_path):
     folder = write_replica(tmp_path, make_samples(3))
     with open(folder / "traj.txt", "a") as file:
         file.write("1 0 0 0\n")
-    with pytest.raises(DatasetError, match="traj.txt line 4: expected the 16 numbers .* found 4"):
+    with pytest.raises(DatasetError, match="traj.txt, line 4: expected 16 columns .* found 4"):
         open_dataset("replica", folder)
 
 

@@ -218,11 +218,11 @@ def test_P7_trajectory_comments_bom_crlf_and_order(tmp_path):
     ("line", "message"),
     [
         ("1 2 3", "line 2: expected 8"),
-        ("1 0 0 0 0 0 0 one", "line 2: expected 8 numbers"),
-        ("1 0 0 nan 0 0 0 1", "line 2: .*finite"),
+        ("1 0 0 0 0 0 0 one", "line 2: 'one' is not a number"),
+        ("1 0 0 nan 0 0 0 1", "line 2: holds NaN or infinite"),
         ("0 0 0 0 0 0 0 1 9", "line 2: expected 8"),
-        ("1 0 0 0 0 0 0 1.1", "length 1.1"),
-        ("1 0 0 0 0 0 0 0", "length 0.0"),
+        ("1 0 0 0 0 0 0 1.1", "line 2: the quaternion's length is 1.1"),
+        ("1 0 0 0 0 0 0 0", "line 2: the quaternion's length is 0.0"),
     ],
 )
 def test_P6_P7_bad_trajectory_line_is_named(tmp_path, line, message):

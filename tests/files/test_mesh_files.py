@@ -100,7 +100,8 @@ def test_we_read_other_programs_ply(tmp_path, mesh, encoding):
 
 
 def test_ply_big_endian_polygons_and_other_elements(tmp_path):
-    header = """ply\r\nformat binary_big_endian 1.0\r\ncomment made by hand\r\nelement camera 1\r\nproperty list uchar float K
+    header = """ply\r\nformat binary_big_endian 1.0\r\ncomment made by hand
+        element camera 1\r\nproperty list uchar float K
         element vertex 5\r\nproperty double x\r\nproperty double y\r\nproperty double z\r\nproperty ushort red
         property ushort green\r\nproperty ushort blue\r\nproperty float quality
         element face 3\r\nproperty uchar flag\r\nproperty list uchar uint vertex_index\r\nend_header\r\n"""

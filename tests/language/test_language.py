@@ -324,13 +324,13 @@ class Payload:
 
 def test_damaged_and_dangerous_files_cost_the_frame_only(tmp_path):
     marker = tmp_path / "was-run"
-    names = ("cut.npy", "text.npy", "pickle.npy", "cut.npz", "two.npz", "flat.npy", "pickle.pt")
+    names = ("cut.npy", "text.npy", "pickle.npy", "archive.npz", "two.npz", "flat.npy", "pickle.pt")
     files = {name: tmp_path / name for name in names}
     np.save(files["cut.npy"], stored())
     files["cut.npy"].write_bytes(files["cut.npy"].read_bytes()[:-9])
     files["text.npy"].write_text("no array")
     np.save(files["pickle.npy"], np.array([Payload(marker)], object), allow_pickle=True)
-    files["cut.npz"].write_bytes(b"PK\x03\x04 cut")
+    files["archive.npz"].write_bytes(b"PK\x03\x04 cut")
     np.savez(files["two.npz"], a=stored(), b=stored())
     np.save(files["flat.npy"], stored(shape=(4, 5)))
     files["pickle.pt"].write_bytes(pickle.dumps(Payload(marker)))

@@ -145,12 +145,12 @@ def test_interpolation_is_constant_motion():
     [
         ("", "holds no poses"),
         ("# nothing\n", "holds no poses"),
-        ("1 2 3\n", "a row has 3 numbers"),
+        ("1 2 3\n", "line 1: expected 8 columns"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", "line 2"),
         ("x 0 0 0 0 0 0 1\n", "'x' is not a time stamp"),
         ("0 0 0 0 0 0 0 2\n", "quaternion's length is 2"),
         ("0 0 0 nan 0 0 0 1\n", "no usable pose"),
-        (" ".join(["1"] * 12) + "\n1 0\n", "expected 12 numbers"),
+        (" ".join(["1"] * 12) + "\n1 0\n", "line 2: expected 12 columns (the first 3 rows of a 4x4 matrix), found 2"),
         (" ".join(["1"] * 16), "no usable pose"),
     ],
 )
