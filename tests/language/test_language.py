@@ -324,7 +324,7 @@ class Payload:
 
 def test_damaged_and_dangerous_files_cost_the_frame_only(tmp_path):
     marker = tmp_path / "was-run"
-    names = ("cut.npy", "text.npy", "pickle.npy", "archive.npz", "two.npz", "flat.npy", "pickle.pt")
+    names = ("cut.npy", "text.npy", "pickle.npy", "archive.npz", "two.npz", "flat.npy", "tensor.pt")
     files = {name: tmp_path / name for name in names}
     np.save(files["cut.npy"], stored())
     files["cut.npy"].write_bytes(files["cut.npy"].read_bytes()[:-9])
@@ -333,7 +333,7 @@ def test_damaged_and_dangerous_files_cost_the_frame_only(tmp_path):
     files["archive.npz"].write_bytes(b"PK\x03\x04 cut")
     np.savez(files["two.npz"], a=stored(), b=stored())
     np.save(files["flat.npy"], stored(shape=(4, 5)))
-    files["pickle.pt"].write_bytes(pickle.dumps(Payload(marker)))
+    files["tensor.pt"].write_bytes(pickle.dumps(Payload(marker)))
     encoder = make_image_encoder(f"folder:{tmp_path}")
     for stem in ("text", "two", "flat"):
         with pytest.raises(FrameError):
