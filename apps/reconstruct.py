@@ -7,7 +7,7 @@ python apps/reconstruct.py 7scenes path/to/redkitchen results/kitchen
 import sys
 
 import taichi_unifusion as uf
-from taichi_unifusion.results.writer import write_results
+from taichi_unifusion.results import write_results
 
 
 def main(format: str, path: str, out: str) -> None:

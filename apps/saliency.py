@@ -8,7 +8,7 @@ path/to/redkitchen results/saliency u2net.onnx,size=320x320,activation=minmax
 import sys
 
 import taichi_unifusion as uf
-from taichi_unifusion.results.writer import write_results
+from taichi_unifusion.results import write_results
 
 
 def main(format: str, path: str, out: str, network: str = "") -> None:

@@ -8,7 +8,7 @@ python apps/style.py replica path/to/office0 results/style candy.onnx
 import sys
 
 import taichi_unifusion as uf
-from taichi_unifusion.results.writer import write_results
+from taichi_unifusion.results import write_results
 
 
 def main(format: str, path: str, out: str, network: str = "") -> None:

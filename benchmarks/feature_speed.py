@@ -12,7 +12,7 @@ import numpy as np
 
 import taichi_unifusion as uf
 from taichi_unifusion import runtime
-from taichi_unifusion.cli.terminal import format_table
+from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.language import unit_length
 from taichi_unifusion.language.embeddings import TextEmbeddings
 from taichi_unifusion.language.questions import ask

@@ -23,7 +23,7 @@ from house_features import NAMES, SINGLE_FRAME, HeldOut, HouseFeatures, find_noi
 from numpy.typing import NDArray
 
 import taichi_unifusion as uf
-from taichi_unifusion.cli.terminal import format_table
+from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.datasets.scene import SceneDataset
 from taichi_unifusion.evaluation.segmentation import evaluate_segmentation
 from taichi_unifusion.language.embeddings import TextEmbeddings, read_embeddings

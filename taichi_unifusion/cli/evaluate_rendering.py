@@ -12,9 +12,10 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..datasets import Dataset, open_dataset
 from ..errors import DatasetError, FrameError, InputError
+from ..results.tables import format_table
 from .recording import FORMAT_DEFAULT
 from .scores import ScoreOptions, cell, percent
-from .terminal import format_table, frame_progress
+from .terminal import frame_progress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -158,15 +159,17 @@ def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Ru
             )
         return open_dataset(options.format, options.path, **given), None
     if options.format is None:
-        run = replace(run, reading={**run.reading, **given})
+        source = replace(run.source, reading={**run.source.reading, **given})
     else:
-        run = replace(
-            run,
+        known = run.source.reading if run.source.format == options.format else {}
+        source = replace(
+            run.source,
             format=options.format,
-            path=options.path,
-            reading={**(run.reading if run.format == options.format else {}), **given},
+            path=str(options.path or ""),
+            reading={**known, **given},
         )
-    return run.recording(), run
+    run = replace(run, source=source)
+    return run.recording, run
 
 
 def choose_frames(
@@ -175,9 +178,10 @@ def choose_frames(
     """The frames to compare with, of `count` in the recording: held-out ones, unless `options.all`."""
     start, end, every = options.start, options.end, options.every
     if run is not None and (start, end, every) == (None, None, None):
-        start, every = run.start + (0 if options.all else run.every // 2), run.every
-    start = (run.start if run else 0) if start is None else start
-    end = run.stop if end is None and run and start < run.stop else end
+        every = run.source.every
+        start = run.source.start + (0 if options.all else every // 2)
+    start = (run.source.start if run else 0) if start is None else start
+    end = run.source.asked.stop if end is None and run and start < run.source.asked.stop else end
     every = 1 if every is None else every
     if start < 0 or every < 1 or (end is not None and end <= start):
         raise InputError(
@@ -217,7 +221,7 @@ def _usable(
 
 def _color_map(options: EvaluateRendering, run: Run | None):
     """The colour map of the run, or None where vertex colours are to be judged."""
-    path = run.directory / "maps" / "color.safetensors" if run else None
+    path = run.folder.map("color") if run else None
     if path is None or options.vertex_colors:
         return None
     if not path.exists():

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
+from ..results.tables import format_table
 from .scores import ScoreOptions, percent
-from .terminal import format_table
 
 if TYPE_CHECKING:
     from ..files.labels import LabelFile

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..errors import InputError
+from ..results.tables import format_table
 from .scores import ScoreOptions, cell, percent
-from .terminal import format_table
+
+if TYPE_CHECKING:
+    from ..results.reader import Run
+    from ..types import Mesh
+
+NO_TRUTH = "surface: give the true mesh too: unifusion evaluate surface MESH TRUTH"
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,7 @@ def evaluate_surface(options: EvaluateSurface) -> int:
     run = find_run(options.reconstruction)
     judge = run if options.seen_by is None else read_run(options.seen_by)
     if options.ground_truth is None and judge is None:
-        raise InputError("surface: give the true mesh too: unifusion evaluate surface MESH TRUTH")
+        raise InputError(NO_TRUTH)
     runtime.init(options.device)
     mesh = (
         run.mesh().transformed(run.T_recording_run())
@@ -74,9 +80,7 @@ def evaluate_surface(options: EvaluateSurface) -> int:
         else read_any_mesh(options.reconstruction)
     )
     views = judge.views() if judge and not options.whole else None
-    truth = (
-        _own_truth(judge) if options.ground_truth is None else read_any_mesh(options.ground_truth)
-    )
+    truth = read_any_mesh(options.ground_truth) if options.ground_truth else _own_truth(judge)
     result = evaluate(
         mesh,
         truth,
@@ -111,7 +115,7 @@ def evaluate_surface(options: EvaluateSurface) -> int:
         "metric": "surface",
         "reconstruction": options.reconstruction,
         "ground_truth": options.ground_truth or "the recording's",
-        "seen_by": judge.directory if views else None,
+        "seen_by": judge.folder.path if judge and views else None,
         "distance_to": options.to,
         "samples": options.samples,
         "seed": options.seed,
@@ -119,12 +123,14 @@ def evaluate_surface(options: EvaluateSurface) -> int:
     return options.show(about, result, format_table(shares), format_table(means), judged)
 
 
-def _own_truth(run):
+def _own_truth(run: Run | None) -> Mesh:
     """The mesh that the recording of a run was rendered from."""
-    recording = run.recording()
+    if run is None:
+        raise InputError(NO_TRUTH)
+    recording = run.recording
     if not hasattr(recording, "ground_truth_mesh"):
         raise InputError(
-            f"surface: a recording of format '{run.format}' holds no true surface; give one: "
+            f"surface: a recording of format '{run.source.format}' holds no true surface; give one: "
             "unifusion evaluate surface RESULTS TRUTH"
         )
     return recording.ground_truth_mesh()

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
+from ..results.tables import format_table
 from .scores import ScoreOptions, cell
-from .terminal import format_table
 
 if TYPE_CHECKING:
     from ..types import Trajectory
@@ -89,14 +89,14 @@ def evaluate_trajectory(options: EvaluateTrajectory) -> int:
 def _read(options: EvaluateTrajectory) -> tuple[Trajectory, Trajectory]:
     from ..files.trajectories import read_trajectory
     from ..results.reader import find_run
+    from ..results.run_folder import RunFolder
 
-    run = find_run(options.estimate)
-    if run is None and options.ground_truth is None:
+    run, truth = find_run(options.estimate), options.ground_truth
+    if truth is not None:
+        estimate = run.trajectory() if run else read_trajectory(options.estimate)
+        return estimate, read_trajectory(RunFolder(truth).trajectory if truth.is_dir() else truth)
+    if run is None:
         raise InputError(
             "trajectory: give the true poses too: unifusion evaluate trajectory FILE TRUTH"
         )
-    estimate = run.trajectory() if run else read_trajectory(options.estimate)
-    if options.ground_truth is None:
-        return estimate, run.true_trajectory()
-    truth = options.ground_truth
-    return estimate, read_trajectory(truth / "trajectory.txt" if truth.is_dir() else truth)
+    return run.trajectory(), run.true_trajectory()

@@ -10,7 +10,9 @@ from tyro.conf import Positional, arg
 
 from ..config import MeshSettings
 from ..errors import FileError, InputError, UniFusionError
-from .terminal import format_bytes, report
+from ..results.run_folder import RunFolder
+from ..results.tables import format_bytes
+from .terminal import report
 
 
 @dataclass(frozen=True)
@@ -37,21 +39,19 @@ class ExtractMesh:
 def extract_mesh(options: ExtractMesh) -> int:
     """Saved maps -> mesh files, those of single properties included."""
     from ..files.atomic import check_writable
+    from ..files.maps import read_manifest
     from ..files.meshes import MESH_SUFFIXES, write_mesh
 
-    files = [options.out] if options.out else [options.dir / "mesh.ply", options.dir / "mesh.glb"]
+    folder = RunFolder(options.dir)
+    files = [options.out] if options.out else [folder.mesh_file("ply"), folder.mesh_file("glb")]
     if files[0].suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
             f"{files[0]}: a mesh is written as {', '.join(MESH_SUFFIXES)}, not as '{files[0].suffix}'"
         )
-    maps = {
-        path.stem: path
-        for path in sorted((options.dir / "maps").glob("*.safetensors"))
-        if path.stem != "features"
-    }
+    maps = folder.maps
     if "surface" not in maps:
         raise FileError(
-            f"{options.dir}: no maps/surface.safetensors here; give the results folder of `unifusion reconstruct`"
+            f"{options.dir}: no {folder.relative(folder.map('surface'))} here; give the results folder of `unifusion reconstruct`"
         )
     check_writable(files[0].parent)
     from .. import pipeline, runtime
@@ -59,13 +59,17 @@ def extract_mesh(options: ExtractMesh) -> int:
 
     runtime.init(options.device)
     surface = SurfaceMap.load(maps.pop("surface"))
-    properties = {name: PropertyMap.load(path) for name, path in maps.items()}
+    properties = {
+        name: PropertyMap.load(path)
+        for name, path in maps.items()
+        if read_manifest(path)["kind"] == PropertyMap.kind  # others give vertices no value
+    }
     mesh = pipeline.extract_mesh(surface, properties, options.resolution, options.min_area)
     meshes = dict.fromkeys(files, mesh)
     if not options.out:
-        from ..results.writer import property_meshes
+        from ..results.property_files import property_meshes
 
-        meshes.update(property_meshes(options.dir, mesh))
+        meshes.update(property_meshes(folder, mesh))
     failures = []
     for file, shown in meshes.items():
         try:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from .terminal import format_table, report
+from ..results.tables import format_table
+from .terminal import report
 from .texts import TextOptions, read_understood
 
 if TYPE_CHECKING:
@@ -55,10 +56,12 @@ def query(options: Query) -> int:
         )
     from ..files.atomic import check_writable, write_text
     from ..language.questions import ask
-    from ..results.writer import ResultsFolder
+    from ..results.folder_writer import FolderWriter
+    from ..results.run_folder import RunFolder
 
     understood = read_understood(options.dir, options.device)
-    folder = ResultsFolder(check_writable(options.dir))
+    folder = RunFolder(check_writable(options.dir))
+    writer = FolderWriter(folder)
     encoder = options.encoder(understood.features.settings.source)
     answers = ask(
         understood.features,
@@ -76,24 +79,23 @@ def query(options: Query) -> int:
 
     listed = []
     for answer in answers:
-        mesh, name = heat_mesh(understood.mesh, answer.relevance), f"query-{file_name(answer.text)}"
-        folder.write(f"{name}.ply", lambda path, mesh=mesh: write_mesh(path, mesh))
+        mesh, name = heat_mesh(understood.mesh, answer.relevance), file_name(answer.text)
+        file, picture = folder.answer_mesh(name), folder.answer_picture(name)
+        writer.write(file, lambda path, mesh=mesh: write_mesh(path, mesh))
         cameras = (
             cameras_that_see(understood.trajectory, answer.regions[0].centroid)
             if answer.found
             else understood.trajectory
         )
-        folder.write(
-            f"{name}.png",
+        writer.write(
+            picture,
             lambda path, mesh=mesh, cameras=cameras: render_preview(mesh, path, trajectory=cameras),
         )
-        listed.append(
-            {"mesh": f"{name}.ply", "picture": f"{name}.png", **describe(answer, options.top)}
-        )
+        listed.append({"mesh": file.name, "picture": picture.name, **describe(answer, options.top)})
     text = json.dumps(listed, indent=2)
-    folder.write("query.json", lambda path: write_text(path, text + "\n"))
+    writer.write(folder.answers, lambda path: write_text(path, text + "\n"))
     print(text if options.json else "\n\n".join(_table(entry) for entry in listed))
-    return report(folder.failures)
+    return report(writer.failures)
 
 
 def describe(answer: Answer, top: int) -> dict[str, Any]:

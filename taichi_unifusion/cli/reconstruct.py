@@ -15,11 +15,12 @@ from ..config import Config
 from ..datasets import Dataset
 from .interrupts import INTERRUPTED, stop_on_signal
 from .recording import RecordingOptions
-from .terminal import frame_progress, report, summarize
+from .terminal import frame_progress, report
 from .tracking import TrackingOptions
 
 if TYPE_CHECKING:
     from ..language import ImageEncoder
+    from ..results.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
 
@@ -61,32 +62,33 @@ def reconstruct(options: Reconstruct, encoder: ImageEncoder | None = None) -> in
     options.check_poses(frames)
     from ..results.writer import prepare_results, remove_temporaries
 
-    directory = prepare_results(options.out)
-    with stop_on_signal(clean_up=lambda: remove_temporaries(directory)) as stop:
-        return _run_and_write(options, frames, directory, stop, encoder)
+    folder = prepare_results(options.out)
+    with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
+        return _run_and_write(options, frames, folder, stop, encoder)
 
 
 def _run_and_write(
     options: Reconstruct,
     frames: Dataset,
-    directory: Path,
+    folder: RunFolder,
     stop: Callable[[], bool],
     encoder: ImageEncoder | None,
 ) -> int:
     from ..pipeline import Pipeline
-    from ..results.writer import TRACKING_FILES, write_results
+    from ..results.summary import summarize
+    from ..results.writer import write_results
 
-    about, written = {"recording": {**options.about, "frames": len(frames)}}, []
+    source, tracking, written = options.source(len(frames)), None, ()
     if options.tracked:
-        frames, about["tracking"] = options.track(options, options.settings, directory, stop)
-        written = [*TRACKING_FILES]
+        frames, tracking = options.track(options, options.settings, folder, stop)
+        written = folder.tracking_files
     pipeline = Pipeline(options.settings, encoder=encoder)
     with frame_progress(len(frames)) as on_frame:
         run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
     if not run.steps:
         logger.warning(
             "stopped before the first frame was done; %s",
-            f"{' and '.join(written)} hold the poses found until then"
+            f"{' and '.join(file.name for file in written)} hold the poses found until then"
             if written
             else "nothing was written",
         )
@@ -99,11 +101,11 @@ def _run_and_write(
             done,
             len(frames),
         )
-    results = write_results(directory, pipeline, run, about, written)
+    results = write_results(folder.path, pipeline, run, source, tracking, written)
     print(
-        json.dumps(results.metrics, indent=2)
+        json.dumps(results.record.to_json(), indent=2)
         if options.json
-        else summarize(results.metrics, results.files, directory)
+        else summarize(results.record, results.files, folder.path)
     )
     code = report([error for error in (run.failure, *results.failures) if error])
     return INTERRUPTED if stop() else code

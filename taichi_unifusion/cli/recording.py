@@ -10,6 +10,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..datasets import FORMATS, Dataset, open_dataset
 from ..errors import DatasetError, InputError
+from ..results.record import Source
 
 FORMAT_DEFAULT = "(default: the format's)"
 
@@ -76,17 +77,17 @@ class RecordingOptions:
             )
         return frames
 
-    @property
-    def about(self) -> dict[str, object]:
-        """The recording and the choice of frames, for the metrics."""
-        return {
-            "format": self.format,
-            "path": str(self.path or ""),
-            "start": self.start,
-            "end": self.end,
-            "every": self.every,
-            "reading": {
+    def source(self, frames: int) -> Source:
+        """The recording and the choice of frames, how many they are included, for the record."""
+        return Source(
+            format=self.format,
+            path=str(self.path or ""),
+            start=self.start,
+            end=self.end,
+            every=self.every,
+            frames=frames,
+            reading={
                 name: str(value) if isinstance(value, Path) else value
                 for name, value in self.reading.items()
             },
-        }
+        )

@@ -13,7 +13,8 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from ..errors import InputError
-from .terminal import format_table, report
+from ..results.tables import format_table
+from .terminal import report
 from .texts import TextOptions, read_understood
 
 
@@ -49,11 +50,13 @@ def segment(options: Segment) -> int:
     from ..language.pictures import label_colors, label_mesh, segmentation_picture
     from ..language.questions import segment as segment_points
     from ..rendering.preview import write_png
-    from ..results.writer import ResultsFolder
+    from ..results.folder_writer import FolderWriter
+    from ..results.run_folder import RunFolder
 
     truth = _read_truth(options.truth) if options.truth else None
     understood = read_understood(options.dir, options.device)
-    folder = ResultsFolder(check_writable(options.dir))
+    folder = RunFolder(check_writable(options.dir))
+    writer = FolderWriter(folder)
     encoder = options.encoder(understood.features.settings.source)
     found = segment_points(
         understood.features,
@@ -64,9 +67,9 @@ def segment(options: Segment) -> int:
     )
     colors = label_colors(len(names))
     mesh = label_mesh(understood.mesh, found, tuple(names), colors)
-    folder.write("segmentation.ply", lambda path: write_mesh(path, mesh))
-    folder.write(
-        "segmentation.png",
+    writer.write(folder.segmentation_mesh, lambda path: write_mesh(path, mesh))
+    writer.write(
+        folder.segmentation_picture,
         lambda path: write_png(
             path, segmentation_picture(mesh, found, colors, understood.trajectory)
         ),
@@ -75,9 +78,9 @@ def segment(options: Segment) -> int:
     if truth is not None:
         summary["scores"] = _scores(understood.features, encoder, names, truth, options.templates)
     text = json.dumps(summary, indent=2)
-    folder.write("segmentation.json", lambda path: write_text(path, text + "\n"))
-    print(text if options.json else _tables(summary, folder.files))
-    return report(folder.failures)
+    writer.write(folder.segmentation, lambda path: write_text(path, text + "\n"))
+    print(text if options.json else _tables(summary, writer.files))
+    return report(writer.failures)
 
 
 def read_labels_file(path: Path) -> dict[int, str]:

@@ -1,15 +1,12 @@
-"""What a person sees of a command: messages, a progress bar where stderr is a screen, and tables in
-plain text.
-"""
+"""What a person sees of a command: messages, and a progress bar where stderr is a screen."""
 
 from __future__ import annotations
 
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 DONE, FAILED = 0, 2  # exit codes
@@ -127,74 +124,3 @@ def _progress_lines() -> Callable[[int, int], None]:
         logger.info("frame %d of %d%s", done, total, left)
 
     return update
-
-
-def format_table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as aligned columns; cells that are numbers go to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    numeric = [all(cell[:1].isdigit() for cell in column[1:]) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if right else cell.ljust(width)
-            for cell, width, right in zip(row, widths, numeric, strict=True)
-        ).rstrip()
-        for row in rows
-    )
-
-
-def format_bytes(count: float) -> str:
-    """A size as people write it, in powers of 1000."""
-    for unit in ("B", "kB", "MB"):
-        if count < 1000:
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
-        count /= 1000
-    return f"{count:.2f} GB"
-
-
-def _tracking_lines(tracking: Mapping[str, Any] | None) -> list[str]:
-    """How the poses were found, where they were."""
-    if not tracking:
-        return []
-    counts = ", ".join(f"{count} {verdict}" for verdict, count in tracking["verdicts"].items())
-    found = [f"{tracking[name]} {name}" for name in ("keyframes", "loops") if name in tracking]
-    return [
-        f"tracking {tracking['mode']}: {counts}{'; ' if found else ''}{', '.join(found)} ({tracking['seconds']:.1f} s)"
-    ]
-
-
-def summarize(metrics: Mapping[str, Any], files: Sequence[str], directory: Path) -> str:
-    """The end of a run in some lines: its metrics, and the files that it wrote."""
-    frames, seconds, mesh = metrics["frames"], metrics["seconds"], metrics["mesh"]
-    stages = [["stage", "median ms", "mean ms"]]
-    stages += [
-        [stage, f"{value['median']:.1f}", f"{value['mean']:.1f}"]
-        for stage, value in metrics["milliseconds"].items()
-    ]
-    maps = [["map", "voxels", "voxel size", "memory"]]
-    maps += [
-        [
-            name,
-            f"{value['voxels']:,}",
-            f"{100 * value['voxel_size']:g} cm",
-            format_bytes(value["bytes"]),
-        ]
-        for name, value in metrics["maps"].items()
-    ]
-    lines = _tracking_lines(metrics.get("tracking"))
-    lines += [
-        f"frames   {frames['used']} used, {frames['skipped']} skipped{', stopped early' if frames['interrupted'] else ''}"
-    ]
-    lines += [
-        f"           {entry['frames']} {entry['reason']} (first: {entry['first']})"
-        for entry in frames["reasons"]
-    ]
-    lines += ["", format_table(stages), "", format_table(maps), ""]
-    if mesh:
-        lines.append(f"mesh     {mesh['vertices']:,} vertices, {mesh['triangles']:,} triangles")
-    lines += [
-        f"time     {seconds['frames']:.1f} s for the frames, {seconds['mesh']:.1f} s for the mesh, "
-        f"{seconds['write']:.1f} s to write",
-        f"memory   {format_bytes(metrics['peak_memory_bytes'])} at most, on {metrics['device_name']}",
-        f"results  {directory}: {', '.join(files)}",
-    ]
-    return "\n".join(lines)

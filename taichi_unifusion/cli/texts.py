@@ -98,19 +98,18 @@ def read_understood(directory: Path, device: str) -> Understood:
     from ..files.mesh_reading import read_mesh
     from ..files.trajectories import read_trajectory
     from ..maps import LatentMap
+    from ..pipeline import FEATURES
+    from ..results.run_folder import RunFolder
 
-    file, mesh_file, poses = (
-        directory / "maps" / "features.safetensors",
-        directory / "mesh.ply",
-        directory / "trajectory.txt",
-    )
+    folder = RunFolder(directory)
+    file, mesh_file, poses = folder.map(FEATURES), folder.mesh, folder.trajectory
     if not file.exists():
         raise FileError(
-            f"{directory}: no maps/features.safetensors here; give the results folder of `unifusion understand`"
+            f"{directory}: no {folder.relative(file)} here; give the results folder of `unifusion understand`"
         )
     if not mesh_file.exists():
         raise FileError(
-            f"{directory}: no mesh.ply here; `unifusion mesh {directory}` makes it again"
+            f"{directory}: no {mesh_file.name} here; `unifusion mesh {directory}` makes it again"
         )
     mesh = read_mesh(mesh_file)
     if not len(mesh.vertices) or not len(mesh.faces):

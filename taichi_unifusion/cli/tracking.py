@@ -13,6 +13,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 from ..config import Config
 from ..datasets import Dataset
 from ..errors import DatasetError
+from ..results.run_folder import RunFolder
 from .recording import RecordingOptions
 from .terminal import frame_progress
 
@@ -52,18 +53,17 @@ class TrackingOptions:
         self,
         recording: RecordingOptions,
         settings: Config,
-        directory: Path,
+        folder: RunFolder,
         stop: Callable[[], bool],
     ) -> tuple[Dataset, dict[str, object]]:
         """The frames that are asked for with their poses, and what to say of them in the metrics.
 
         All frames between the first and the last are tracked, whatever `--every` leaves for the
-        map: small steps are easier. Poses are written to tracking.csv and tracking.txt at once, so
+        map: small steps are easier. Poses are written at once, so
         that they outlive whatever comes after.
         """
         from .. import runtime
         from ..files.trajectories import write_trajectory
-        from ..results.writer import TRACKING_FILES
         from ..tracking import make_tracker
         from ..tracking.sequence import PosedFrames, track_sequence, write_tracking
 
@@ -80,9 +80,8 @@ class TrackingOptions:
         logger.info("tracking: %s", self.tracking)
         with frame_progress(len(frames)) as on_frame:
             result = track_sequence(frames, tracker, stop=stop, on_frame=on_frame)
-        verdicts, poses = TRACKING_FILES
-        write_tracking(directory / verdicts, result)
-        write_trajectory(directory / poses, result.trajectory)
+        write_tracking(folder.tracking, result)
+        write_trajectory(folder.tracked_poses, result.trajectory)
         return PosedFrames(frames, result)[:: recording.every], {
             "mode": self.tracking,
             **result.details,

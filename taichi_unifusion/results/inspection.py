@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-from ..cli.terminal import format_bytes, format_table
 from ..errors import FileError, MapCorrupt, UniFusionError
-from ..files.atomic import read_bytes
 from ..files.maps import read_map
 from ..files.mesh_reading import read_mesh
+from .record import Source, read_record
+from .run_folder import RunFolder
+from .summary import count_frames
+from .tables import format_bytes, format_table
+
+T = TypeVar("T")
 
 MAP_COLUMNS = ["map", "kind", "voxels", "voxel size", "file", "encoder", "fusion", "version"]
 
@@ -29,24 +33,21 @@ def inspect(path: Path) -> Inspection:
     to describe.
     """
     if path.is_dir():
-        maps, mesh, metrics = (
-            sorted((path / "maps").glob("*.safetensors")),
-            path / "mesh.ply",
-            path / "metrics.json",
-        )
-        if not (maps or mesh.exists() or metrics.exists()):
+        folder = RunFolder(path)
+        maps, mesh, record = list(folder.maps.values()), folder.mesh, folder.record
+        if not (maps or mesh.exists() or record.exists()):
             raise FileError(
-                f"{path}: holds no results; expected maps/*.safetensors, mesh.ply or metrics.json"
+                f"{path}: holds no results; expected {folder.relative(folder.map('*'))}, {mesh.name} or {record.name}"
             )
     elif not path.exists():
         raise FileError(f"{path}: no such file or folder")
     elif path.suffix.lower() == ".ply":
-        maps, mesh, metrics = [], path, None
+        maps, mesh, record = [], path, None
     else:
-        maps, mesh, metrics = [path], None, None
+        maps, mesh, record = [path], None, None
     problems: list[UniFusionError] = []
 
-    def attempt(describe: Callable, file: Path | None):
+    def attempt(describe: Callable[[Path], T], file: Path | None) -> T | None:
         try:
             return describe(file) if file and file.exists() else None
         except UniFusionError as error:
@@ -57,7 +58,7 @@ def inspect(path: Path) -> Inspection:
     texts = [
         format_table([MAP_COLUMNS, *rows]) if rows else None,
         attempt(_describe_mesh, mesh),
-        attempt(_describe_run, metrics),
+        attempt(_describe_run, record),
     ]
     return Inspection("\n\n".join(text for text in texts if text), tuple(problems))
 
@@ -98,23 +99,17 @@ def _describe_mesh(file: Path) -> str:
 
 
 def _describe_run(file: Path) -> str:
-    try:
-        metrics = json.loads(read_bytes(file))
-        frames, versions = metrics["frames"], metrics["versions"]
-        return "\n".join(
-            [
-                *([_describe_recording(metrics["recording"])] if "recording" in metrics else []),
-                f"frames  {frames['used']} used, {frames['skipped']} skipped{', stopped early' if frames['interrupted'] else ''}",
-                f"made    by taichi_unifusion {versions['taichi_unifusion']} on {metrics['device_name']}, "
-                f"{metrics['milliseconds']['frame']['median']:.0f} ms a frame (median)",
-            ]
-        )
-    except (ValueError, KeyError, TypeError) as error:
-        raise FileError(f"{file}: not the metrics of a run, or a damaged file ({error})") from None
+    record = read_record(file)
+    lines = [] if record.recording is None else [_describe_recording(record.recording)]
+    lines.append(f"frames  {count_frames(record.frames)}")
+    made = f"made    by taichi_unifusion {record.versions.get('taichi_unifusion', '?')} on {record.device_name}"
+    if frame := record.milliseconds.get("frame"):
+        made += f", {frame.median:.0f} ms a frame (median)"
+    lines.append(made)
+    return "\n".join(lines)
 
 
-def _describe_recording(recording: dict[str, object]) -> str:
-    source = f"{recording['format']} {recording['path']}".rstrip()
-    last = "the last" if recording["end"] is None else int(recording["end"]) - 1
-    steps = f" in steps of {recording['every']}" if recording["every"] != 1 else ""
-    return f"from    {source}, frames {recording['start']} to {last}{steps}"
+def _describe_recording(source: Source) -> str:
+    last = "the last" if source.end is None else source.end - 1
+    steps = f" in steps of {source.every}" if source.every != 1 else ""
+    return f"from    {f'{source.format} {source.path}'.rstrip()}, frames {source.start} to {last}{steps}"

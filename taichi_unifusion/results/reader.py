@@ -4,12 +4,10 @@ mesh, poses and settings.
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +17,11 @@ from ..datasets import Dataset, open_dataset
 from ..errors import DatasetError, FileError, FrameError
 from ..evaluation.trajectory import align_poses, match_poses
 from ..evaluation.viewpoints import Viewpoints
-from ..files.atomic import read_bytes
 from ..files.mesh_reading import read_mesh
 from ..files.trajectories import read_trajectory
 from ..types import Mesh, Trajectory
+from .record import Source, read_record
+from .run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
 
@@ -33,46 +32,45 @@ class Run:
     are in its own world.
     """
 
-    directory: Path
-    format: str
-    path: Path | None  # of the recording
-    reading: Mapping[str, Any]  # options that it was opened with
-    start: int  # the frames asked for: every `every`-th from `start` to before `stop`
-    stop: int
-    every: int
+    folder: RunFolder
+    source: Source  # the frames asked for
     used: tuple[int, ...]  # the frames fused, by their place in the recording
     tracked: bool  # its poses are not the recording's
 
+    @cached_property
     def recording(self) -> Dataset:
         """The recording that the run read; raises DatasetError where it is no longer there."""
+        source = self.source
         try:
-            return open_dataset(self.format, self.path, **self.reading)
+            return open_dataset(source.format, source.path or None, **source.reading)
         except DatasetError as error:
             raise DatasetError(
-                f"{self.directory} was made from {self.format} {self.path or ''}, which cannot be opened: "
+                f"{self.folder.path} was made from {source.format} {source.path}, which cannot be opened: "
                 f"{error}"
             ) from None
 
     def config(self) -> Config:
         """The settings of the run."""
-        return load_config(self.directory / "config.yaml")
+        return load_config(self.folder.config)
 
     def mesh(self) -> Mesh:
         """The mesh that the run made; raises FileError where there is none."""
-        path = self.directory / "mesh.ply"
+        path = self.folder.mesh
         if not path.exists():
-            raise FileError(f"{path}: no such file; make it with: unifusion mesh {self.directory}")
+            raise FileError(
+                f"{path}: no such file; make it with: unifusion mesh {self.folder.path}"
+            )
         return read_mesh(path)
 
     def trajectory(self) -> Trajectory:
         """The poses that the run used, one a frame of `used`."""
-        return read_trajectory(self.directory / "trajectory.txt")
+        return read_trajectory(self.folder.trajectory)
 
     def true_trajectory(self) -> Trajectory:
         """The recording's own poses of the frames used; a frame without one is left out. Raises
         DatasetError if all are.
         """
-        recording, stamps, poses, numbers = self.recording(), [], [], []
+        recording, stamps, poses, numbers = self.recording, [], [], []
         for index in self.used:
             try:
                 frame = recording[index]
@@ -84,14 +82,14 @@ class Run:
                 poses.append(frame.T_world_camera)
         if not poses:
             raise DatasetError(
-                f"{recording.name}: has no poses of the {len(self.used)} frames that {self.directory} was made "
+                f"{recording.name}: has no poses of the {len(self.used)} frames that {self.folder.path} was made "
                 "from"
             )
         return Trajectory.of(stamps, numbers, poses)
 
     def T_recording_run(self) -> NDArray[np.float64]:
-        """Takes the run's world to the recording's: the same, unless poses were tracked; then these
-        are fitted to its own.
+        """Takes the run's world to the recording's: the identity, unless poses were tracked; then
+        these are fitted to the recording's own.
         """
         if not self.tracked:
             return np.eye(4)
@@ -107,7 +105,7 @@ class Run:
     def views(self) -> Viewpoints:
         """Where its cameras looked from, in the recording's world, within the depth that it used."""
         limits = self.config().preprocess
-        camera = self.recording()[self.used[0]].camera
+        camera = self.recording[self.used[0]].camera
         return Viewpoints(
             camera,
             self.T_recording_run() @ self.trajectory().T_world_camera,
@@ -127,31 +125,18 @@ def read_run(directory: str | Path) -> Run:
     """Read what `unifusion reconstruct` wrote beside its maps; raises FileError where that is
     missing or damaged.
     """
-    directory = Path(directory)
-    file = directory / "metrics.json"
-    if not file.exists():
+    folder = RunFolder(Path(directory))
+    if not folder.record.exists():
         raise FileError(
-            f"{directory}: holds no metrics.json; give the results folder of `unifusion reconstruct`"
+            f"{directory}: holds no {folder.record.name}; give the results folder of `unifusion reconstruct`"
         )
-    try:
-        metrics = json.loads(read_bytes(file))
-        about, frames = metrics["recording"], metrics["frames"]
-        skipped = {int(frame["frame"]) for frame in frames["skipped_frames"]}
-        start, every, count = int(about["start"]), int(about["every"]), int(about["frames"])
-        asked = range(start, start + count * every, every)
-        done = asked[: int(frames["used"]) + len(skipped)]  # it may have been stopped early
-        return Run(
-            directory,
-            str(about["format"]),
-            Path(about["path"]) if about["path"] else None,
-            dict(about.get("reading", {})),
-            start,
-            asked.stop,
-            every,
-            tuple(i for i in done if i not in skipped),
-            bool(metrics.get("tracking")),
-        )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    record = read_record(folder.record)
+    source, frames = record.recording, record.frames
+    if source is None:
         raise FileError(
-            f"{file}: not the metrics of a run, or a damaged file ({type(error).__name__}: {error})"
-        ) from None
+            f"{folder.record}: does not say which recording the run was made from; only runs of `unifusion` do"
+        )
+    skipped = {each.frame for each in frames.skipped_frames}
+    done = source.asked[: frames.used + len(skipped)]  # it may have been stopped early
+    used = tuple(i for i in done if i not in skipped)
+    return Run(folder, source, used, record.tracking is not None)

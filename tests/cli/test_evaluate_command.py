@@ -109,8 +109,9 @@ def with_metrics(results: Path, folder: Path, **changes) -> Path:
 
 def test_a_run_knows_its_frames_camera_and_poses(results, recording):
     run = read_run(results)
-    assert (run.format, run.path, run.used) == ("folder", recording, (0, 3, 6))
-    assert run.views().camera == make_frames(1)[0].camera and len(run.recording()) == FRAMES
+    assert (run.source.format, run.source.path) == ("folder", str(recording))
+    assert run.used == (0, 3, 6)
+    assert run.views().camera == make_frames(1)[0].camera and len(run.recording) == FRAMES
     assert (run.T_recording_run() == np.eye(4)).all()
     np.testing.assert_allclose(
         run.trajectory().T_world_camera, run.true_trajectory().T_world_camera, atol=1e-8

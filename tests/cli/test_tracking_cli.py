@@ -14,7 +14,7 @@ from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
 from taichi_unifusion.geometry import se3
-from taichi_unifusion.results.writer import TRACKING_FILES
+from taichi_unifusion.results import RunFolder
 from taichi_unifusion.types import Trajectory
 
 FEW = ["reconstruct", "synthetic", "--end", "3", *FLAGS]
@@ -91,10 +91,11 @@ def test_every_thins_the_map_and_not_the_tracking(tmp_path):
 
 
 def test_results_of_tracking_do_not_outlive_it(found, tmp_path):
-    for name in TRACKING_FILES:
-        (tmp_path / name).write_text("of an earlier run")
+    earlier = RunFolder(tmp_path).tracking_files
+    for file in earlier:
+        file.write_text("of an earlier run")
     assert cli.main([*FEW, "--out", str(tmp_path)]) == 0
-    assert not any((tmp_path / name).exists() for name in TRACKING_FILES)
+    assert not any(file.exists() for file in earlier)
 
 
 @pytest.mark.parametrize("mode", ["given", "internal"])

@@ -13,7 +13,7 @@ from taichi_unifusion import Pipeline, load_map
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.maps import LatentMap
-from taichi_unifusion.results.writer import write_results
+from taichi_unifusion.results import write_results
 
 COLORS = np.eye(3)  # names are directions of colour here: what is red is "red"
 NAMES = ("red", "green", "blue")

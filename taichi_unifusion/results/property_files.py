@@ -1,0 +1,57 @@
+"""The files of a single property: the mesh in its colours, and a picture of that with a legend."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import FileError, InputError
+from ..rendering.legend import draw_legend, property_mesh
+from ..rendering.look import Look, shown_range
+from ..rendering.preview import draw_preview, write_png
+from ..types import Mesh, Trajectory
+from .record import PropertyRecord, read_record
+from .run_folder import RunFolder
+
+logger = logging.getLogger(__name__)
+
+
+def property_meshes(folder: RunFolder, mesh: Mesh) -> dict[Path, Mesh]:
+    """Mesh files of single properties that a results folder holds, and `mesh` in their colours, as
+    its record tells them.
+    """
+    looks = _recorded_looks(folder)
+    return {
+        file: property_mesh(mesh, name, looks.get(name, Look(range=None)))
+        for name in mesh.attributes
+        if name != "color"
+        for file in folder.property_meshes(name)
+        if file.exists()
+    }
+
+
+def _recorded_looks(folder: RunFolder) -> Mapping[str, Look]:
+    """How each property was coloured; empty where the folder has no record that can be read."""
+    try:
+        record = read_record(folder.record)
+        return {name: _look(shown) for name, shown in record.properties.items()}
+    except (FileError, InputError) as error:
+        logger.warning("%s; properties get their default colours", error)
+        return {}
+
+
+def _look(shown: PropertyRecord) -> Look:
+    return Look(shown.colormap, shown.range, shown.label)
+
+
+def write_property_picture(
+    path: Path, shown: Mesh, name: str, look: Look, trajectory: Trajectory | None
+) -> None:
+    """A picture of a mesh in the colours of its property `name`, above their legend."""
+    picture = draw_preview(shown, trajectory=trajectory)
+    values = shown.attributes[name]
+    legend = draw_legend(picture.shape[1], name, look, *shown_range(values, look), values.shape[1])
+    write_png(path, np.vstack([picture, legend]))

@@ -1,0 +1,142 @@
+"""Where everything lies in the folder of a run: the only place that knows a file's name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+MESH_SUFFIXES = ("ply", "glb", "obj")  # in the order in which meshes are written
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The paths of a run's files; none of them need exist."""
+
+    path: Path
+
+    @property
+    def record(self) -> Path:
+        """What the run did, a RunRecord."""
+        return self.path / "metrics.json"
+
+    @property
+    def config(self) -> Path:
+        """Every setting of the run."""
+        return self.path / "config.yaml"
+
+    @property
+    def trajectory(self) -> Path:
+        """The poses of the frames used, in TUM's format."""
+        return self.path / "trajectory.txt"
+
+    @property
+    def tracking(self) -> Path:
+        """What a tracker says about every frame, as a table."""
+        return self.path / "tracking.csv"
+
+    @property
+    def tracked_poses(self) -> Path:
+        """The poses that a tracker found, those of unused frames too, in TUM's format."""
+        return self.path / "tracking.txt"
+
+    @property
+    def map_folder(self) -> Path:
+        """Where the maps lie."""
+        return self.path / "maps"
+
+    def map(self, name: str) -> Path:
+        """The map of that name."""
+        return self.map_folder / f"{name}.safetensors"
+
+    @property
+    def maps(self) -> dict[str, Path]:
+        """The maps that exist, by name."""
+        return {path.stem: path for path in sorted(self.map_folder.glob(self.map("*").name))}
+
+    @property
+    def mesh(self) -> Path:
+        """The mesh with everything that the maps know of its vertices."""
+        return self.mesh_file("ply")
+
+    def mesh_file(self, suffix: str) -> Path:
+        """The mesh in one of MESH_SUFFIXES."""
+        return self.path / f"mesh.{suffix}"
+
+    @property
+    def meshes(self) -> tuple[Path, ...]:
+        """The mesh in every format."""
+        return tuple(map(self.mesh_file, MESH_SUFFIXES))
+
+    @property
+    def preview(self) -> Path:
+        """A picture of the mesh."""
+        return self.path / "preview.png"
+
+    def property_mesh(self, name: str, suffix: str) -> Path:
+        """The mesh in the colours of a property, in one of MESH_SUFFIXES."""
+        return self.path / f"{name}.{suffix}"
+
+    def property_meshes(self, name: str) -> tuple[Path, ...]:
+        """The mesh in the colours of a property, in every format."""
+        return tuple(self.property_mesh(name, suffix) for suffix in MESH_SUFFIXES)
+
+    def property_picture(self, name: str) -> Path:
+        """A picture of that mesh, with a legend."""
+        return self.path / f"{name}.png"
+
+    def property_files(self, name: str) -> tuple[Path, ...]:
+        """Everything that a run writes of a property beside its map."""
+        return (*self.property_meshes(name), self.property_picture(name))
+
+    @property
+    def answers(self) -> Path:
+        """The regions that a query found."""
+        return self.path / "query.json"
+
+    def answer_mesh(self, text: str) -> Path:
+        """The mesh coloured by relevance to a text, which is given as a part of a file's name."""
+        return self.path / f"query-{text}.ply"
+
+    def answer_picture(self, text: str) -> Path:
+        """A picture of that mesh."""
+        return self.answer_mesh(text).with_suffix(".png")
+
+    @property
+    def segmentation(self) -> Path:
+        """Shares and scores of the labels."""
+        return self.path / "segmentation.json"
+
+    @property
+    def segmentation_mesh(self) -> Path:
+        """The mesh with a label at every vertex."""
+        return self.segmentation.with_suffix(".ply")
+
+    @property
+    def segmentation_picture(self) -> Path:
+        """A picture of that mesh, with a legend."""
+        return self.segmentation.with_suffix(".png")
+
+    @property
+    def tracking_files(self) -> tuple[Path, ...]:
+        """What a tracker leaves."""
+        return self.tracking, self.tracked_poses
+
+    @property
+    def asked(self) -> tuple[Path, ...]:
+        """The files that exist of questions asked: they belong to the maps that were asked."""
+        patterns = (self.answer_mesh("*"), self.answer_picture("*"))
+        found = {file for pattern in patterns for file in self.path.glob(pattern.name)}
+        segmented = (self.segmentation, self.segmentation_mesh, self.segmentation_picture)
+        found |= {file for file in (self.answers, *segmented) if file.exists()}
+        return tuple(sorted(found))
+
+    @property
+    def temporaries(self) -> tuple[Path, ...]:
+        """What writing leaves behind where the process is ended at once."""
+        return tuple(
+            file for folder in (self.path, self.map_folder) for file in folder.glob(".*.tmp")
+        )
+
+    def relative(self, file: Path) -> str:
+        """The name of a file in messages and records: relative to the folder."""
+        return file.relative_to(self.path).as_posix()

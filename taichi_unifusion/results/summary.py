@@ -1,0 +1,62 @@
+"""The end of a run in some lines, for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .record import FrameCounts, RunRecord
+from .tables import format_bytes, format_table
+
+
+def summarize(record: RunRecord, files: Sequence[str], directory: Path) -> str:
+    """What a run did, and the files that it wrote."""
+    frames, seconds, mesh = record.frames, record.seconds, record.mesh
+    stages = [["stage", "median ms", "mean ms"]]
+    stages += [
+        [stage, f"{time.median:.1f}", f"{time.mean:.1f}"]
+        for stage, time in record.milliseconds.items()
+    ]
+    maps = [["map", "voxels", "voxel size", "memory"]]
+    maps += [
+        [
+            name,
+            f"{size.voxels:,}",
+            f"{100 * size.voxel_size:g} cm",
+            format_bytes(size.bytes),
+        ]
+        for name, size in record.maps.items()
+    ]
+    lines = [*tracking_lines(record.tracking), f"frames   {count_frames(frames)}"]
+    lines += [
+        f"           {entry.frames} {entry.reason} (first: {entry.first})"
+        for entry in frames.reasons
+    ]
+    lines += ["", format_table(stages), "", format_table(maps), ""]
+    if mesh:
+        lines.append(f"mesh     {mesh.vertices:,} vertices, {mesh.triangles:,} triangles")
+    lines += [
+        f"time     {seconds.frames:.1f} s for the frames, {seconds.mesh:.1f} s for the mesh, "
+        f"{seconds.write:.1f} s to write",
+        f"memory   {format_bytes(record.peak_memory_bytes)} at most, on {record.device_name}",
+        f"results  {directory}: {', '.join(files)}",
+    ]
+    return "\n".join(lines)
+
+
+def count_frames(frames: FrameCounts) -> str:
+    """How many frames were used, and how many were not."""
+    stopped = ", stopped early" if frames.interrupted else ""
+    return f"{frames.used} used, {frames.skipped} skipped{stopped}"
+
+
+def tracking_lines(tracking: Mapping[str, Any] | None) -> list[str]:
+    """How the poses were found, where they were."""
+    if not tracking:
+        return []
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in tracking["verdicts"].items())
+    found = [f"{tracking[name]} {name}" for name in ("keyframes", "loops") if name in tracking]
+    return [
+        f"tracking {tracking['mode']}: {counts}{'; ' if found else ''}{', '.join(found)} ({tracking['seconds']:.1f} s)"
+    ]
