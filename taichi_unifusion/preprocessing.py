@@ -66,8 +66,6 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
     from .kernels import images as kernels
 
     settings = settings or PreprocessSettings()
-    camera = frame.camera
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     depth, inverse, normals, pixels = _scratch(live, frame.depth.shape)
     _find_normals(frame, settings, depth, inverse, normals)
     counts = np.empty(-(-frame.depth.size // kernels.PIXEL_CHUNK), np.int32)
@@ -82,7 +80,7 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
     kernels.unproject(
         depth,
         normals,
-        *intrinsics,
+        frame.camera.intrinsics,
         (np.cumsum(counts) - counts).astype(np.int32),
         points,
         point_normals,
@@ -121,17 +119,13 @@ def _find_normals(frame: Frame, settings: PreprocessSettings, depth, inverse, no
     """Fill the scratch images from the depth image."""
     from .kernels import images as kernels
 
-    camera = frame.camera
     kernels.clip_depth(
         np.ascontiguousarray(frame.depth), settings.depth_min, settings.depth_max, depth
     )
     kernels.drop_flying_pixels(depth, settings.edge_jump, settings.edge_support, inverse)
     kernels.estimate_normals(
         inverse,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
+        frame.camera.intrinsics,
         settings.normal_radius,
         settings.edge_jump,
         float(np.cos(np.radians(settings.max_angle))),

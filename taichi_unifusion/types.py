@@ -331,7 +331,7 @@ class PointCloud:
         def moved(vectors: NDArray[np.float32], T: NDArray) -> NDArray[np.float32]:
             result = np.empty_like(vectors)
             if len(vectors):
-                transform(vectors, np.ascontiguousarray(T, np.float32), result)
+                transform(vectors, T, result)
             return result
 
         view = None if self.view is None else self.view.transformed(T_b_a)

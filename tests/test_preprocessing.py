@@ -20,7 +20,7 @@ UNIT = 1e-6  # float32 of numbers about 1
 # of normals from noise-free depth: what float32 depth and its inverse leave, with margin
 DEGREE = 1.0
 NORMAL = 1e-3  # float32 slopes of the inverse depth, differences of numbers 1 % apart
-INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+INTRINSICS = CAMERA.intrinsics
 
 
 def plane_frame(normal, distance: float = 2.0, camera: PinholeCamera = CAMERA, **values) -> Frame:
@@ -98,7 +98,7 @@ def test_estimate_normals_equals_its_twin(radius, max_angle):
     inverse = reference.drop_flying_pixels(step_frame().depth, 0.03, 3).astype(np.float32)
     normals = np.empty((48, 64, 3), np.float32)
     limit = float(np.cos(np.radians(max_angle)))
-    kernels.estimate_normals(inverse, *INTRINSICS, radius, 0.03, limit, normals)
+    kernels.estimate_normals(inverse, INTRINSICS, radius, 0.03, limit, normals)
     twin = reference.estimate_normals(inverse.astype(float), *INTRINSICS, radius, 0.03, limit)
     np.testing.assert_array_equal(normals[..., 2] != 0, twin[..., 2] != 0)
     assert 0.2 < (twin[..., 2] != 0).mean() < 0.95
@@ -115,7 +115,7 @@ def test_count_unproject_and_sample_equal_their_twins():
     assert counts.sum() == total
     points, point_normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)
     pixels, starts = np.empty((total, 2), np.int32), (np.cumsum(counts) - counts).astype(np.int32)
-    kernels.unproject(frame.depth, normals, *INTRINSICS, starts, points, point_normals, pixels)
+    kernels.unproject(frame.depth, normals, INTRINSICS, starts, points, point_normals, pixels)
     twin_points, twin_normals, twin_pixels = reference.unproject(frame.depth, normals, *INTRINSICS)
     np.testing.assert_allclose(points, twin_points, rtol=UNIT, atol=UNIT)
     np.testing.assert_array_equal(point_normals, twin_normals)
@@ -133,8 +133,11 @@ def test_transform_equals_its_twin():
     T[:3, :3], T[:3, 3] = np.linalg.qr(rng.normal(size=(3, 3)))[0], (1, -2, 3)
     T[:3, :3] *= np.sign(np.linalg.det(T[:3, :3]))
     points, normals = rng.normal(size=(2, 50, 3)).astype(np.float32)
+    moved = np.empty_like(points)
+    kernels.transform(points, T[:3], moved)
+    np.testing.assert_allclose(moved, reference.transform(points, T), atol=3 * UNIT)
     cloud = PointCloud(points, normals, {"x": points.copy()}).transformed(T)
-    np.testing.assert_allclose(cloud.points, reference.transform(points, T), atol=3 * UNIT)
+    np.testing.assert_array_equal(cloud.points, moved)
     # turned, not shifted
     np.testing.assert_allclose(
         cloud.normals, reference.transform(normals, T) - T[:3, 3], atol=3 * UNIT

@@ -6,6 +6,7 @@ that there is no NaN.
 
 import taichi as ti
 
+from .camera import Intrinsics, Pose, lift, move, ray
 from .voxels import Floats2, Floats3, Ints1, Ints2, row3
 
 Bytes3 = ti.types.ndarray(dtype=ti.u8, ndim=3)
@@ -88,10 +89,7 @@ def inverse_depth_slope(
 def estimate_normals(
     # in:
     inverse: Floats2,  # (H, W) 1/z [1/m], 0: none
-    fx: ti.f32,
-    fy: ti.f32,
-    cx: ti.f32,
-    cy: ti.f32,
+    K: Intrinsics,
     radius: ti.template(),  # of the window [pixels]
     jump: ti.f32,
     cos_max_angle: ti.f32,  # between the normal and the ray back to the camera
@@ -111,18 +109,10 @@ def estimate_normals(
                         slope_u, slope_v, found = inverse_depth_slope(inverse, v, u, radius, jump)
                         of = q
                     if found >= 2 * radius * radius:
-                        ray = ti.Vector([(u - cx) / fx, (v - cy) / fy, 1.0])
-                        m = (
-                            ti.Vector(
-                                [
-                                    slope_u * fx,
-                                    slope_v * fy,
-                                    q - slope_u * (u - cx) - slope_v * (v - cy),
-                                ]
-                            )
-                            / q
-                        )
-                        if cos_max_angle * m.norm() * ray.norm() <= 1.0:  # m . ray = 1
+                        along_z = q - slope_u * (u - K[2]) - slope_v * (v - K[3])
+                        m = ti.Vector([slope_u * K[0], slope_v * K[1], along_z]) / q
+                        # m . ray = 1
+                        if cos_max_angle * m.norm() * ray(u, v, K).norm() <= 1.0:
                             n = -m.normalized()
                 for d in ti.static(range(3)):
                     normals[v, u, d] = n[d]
@@ -146,12 +136,9 @@ def count_points(
 @ti.kernel
 def unproject(
     # in:
-    depth: Floats2,
-    normals: Floats3,
-    fx: ti.f32,
-    fy: ti.f32,
-    cx: ti.f32,
-    cy: ti.f32,
+    depth: Floats2,  # (H, W) [m]
+    normals: Floats3,  # (H, W, 3)
+    K: Intrinsics,
     starts: Ints1,  # (H W / PIXEL_CHUNK,) first point of each chunk
     # out:
     points: Floats2,  # (N, 3) camera [m]
@@ -165,9 +152,9 @@ def unproject(
             v, u = p // width, p % width
             z = depth[v, u]
             if normals[v, u, 2] != 0:
-                points[n, 0], points[n, 1], points[n, 2] = (u - cx) / fx * z, (v - cy) / fy * z, z
+                x = lift(u, v, z, K)
                 for d in ti.static(range(3)):
-                    point_normals[n, d] = normals[v, u, d]
+                    points[n, d], point_normals[n, d] = x[d], normals[v, u, d]
                 pixels[n, 0], pixels[n, 1] = v, u
                 n += 1
 
@@ -202,13 +189,11 @@ def sample_image(
 def transform(
     # in:
     points: Floats2,  # (N, 3) in a
-    matrix: Floats2,  # (3, 4) T_b_a without its last row
+    T_b_a: Pose,
     # out:
     moved: Floats2,  # (N, 3) in b
 ):
-    R = ti.Matrix([[matrix[i, j] for j in range(3)] for i in range(3)])
-    t = ti.Vector([matrix[i, 3] for i in range(3)])
     for n in range(points.shape[0]):
-        x = R @ row3(points, n) + t
+        x = move(T_b_a, row3(points, n))
         for d in ti.static(range(3)):
             moved[n, d] = x[d]

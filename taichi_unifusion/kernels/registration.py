@@ -9,8 +9,9 @@ so that the result does not depend on the order in which threads run.
 
 import taichi as ti
 
+from .camera import Intrinsics, Pose, lift, project
 from .images import Bytes3
-from .voxels import Floats1, Floats2, Floats3
+from .voxels import Floats2, Floats3
 
 # of a surfel image; 8 numbers fill half a cache line
 DEPTH, NORMAL, INTENSITY, SLOPE_U, SLOPE_V, CHANNELS = 0, 1, 4, 5, 6, 8
@@ -124,12 +125,6 @@ def pack_surfels(
 
 
 @ti.func
-def unprojected(u: ti.f32, v: ti.f32, z: ti.f32, K: ti.template()):
-    """The point at depth z [m] of pixel (u, v)."""
-    return ti.Vector([(u - K[2]) / K[0] * z, (v - K[3]) / K[1] * z, z])
-
-
-@ti.func
 def axial_variance(z: ti.f32) -> ti.f32:
     """Of a Kinect's depth [m^2] (Nguyen et al. 2012, Eq. 3)."""
     return (0.0012 + 0.0019 * (z - 0.4) ** 2) ** 2
@@ -196,15 +191,15 @@ def add_pixel(
     limits: ti.template(),
     total: ti.template(),
 ):
-    """Associate one source surfel by projection and add its residuals; limits as in
-    `sum_normal_equations`.
+    """Associate one source surfel by projection and add its residuals; `limits` are gate, cosine,
+    width, sigma and weight as in `sum_normal_equations`.
     """
     z = source[v, u, DEPTH]
     total[SOURCE] += 1.0
-    p = R @ unprojected(u, v, z, K_source) + t
+    p = R @ lift(u, v, z, K_source) + t
     x, y = -1.0, -1.0
     if p[2] > NEAR:
-        x, y = K_target[0] * p[0] / p[2] + K_target[2], K_target[1] * p[1] / p[2] + K_target[3]
+        x, y = project(p, K_target)
     if x >= 0 and y >= 0 and x <= target.shape[1] - 1 and y <= target.shape[0] - 1:
         j, i = ti.cast(x + 0.5, ti.i32), ti.cast(y + 0.5, ti.i32)
         depth = target[i, j, DEPTH]
@@ -212,7 +207,7 @@ def add_pixel(
             total[IN_VIEW] += 1.0
             n = ti.Vector([target[i, j, NORMAL + d] for d in range(3)])
             m = R @ ti.Vector([source[v, u, NORMAL + d] for d in range(3)])
-            r = n.dot(p - unprojected(j, i, depth, K_target))
+            r = n.dot(p - lift(j, i, depth, K_target))
             if ti.abs(r) < limits[0] and n.dot(m) > limits[1]:
                 total[INLIERS] += 1.0
                 total[SQUARED_DISTANCE] += r * r
@@ -240,21 +235,22 @@ def sum_normal_equations(
     # in:
     source: Floats3,  # (h, w, CHANNELS)
     target: Floats3,  # (H, W, CHANNELS)
-    intrinsics: Floats2,  # (2, 4) fx fy cx cy of source and target
-    T_target_source: Floats2,  # (3, 4)
+    K_source: Intrinsics,
+    K_target: Intrinsics,
+    T_target_source: Pose,
     step: ti.i32,  # every step-th pixel of every step-th row of the source is used
-    # (5,): gate, farthest distance of an inlier from the target's plane [m]; smallest cosine
-    # between normals;
-    limits: Floats1,
-    # distance [standard deviations] that counts half; scale of intensity residuals; weight of a
-    # squared intensity residual against a squared distance, both in standard deviations (0:
-    # geometry alone) out:
+    gate: ti.f32,  # farthest distance of an inlier from the target's plane [m]
+    cosine: ti.f32,  # smallest cosine between the normals of an inlier
+    width: ti.f32,  # distance that counts half [standard deviations]
+    sigma: ti.f32,  # scale of intensity residuals
+    # of a squared intensity residual against a squared distance, both in standard deviations; 0:
+    # geometry alone
+    weight: ti.f32,
+    # out:
     sums: Floats2,  # (blocks, SUMS) a row for every BLOCK_ROWS used source rows
 ):
-    K_source = ti.Vector([intrinsics[0, k] for k in range(4)])
-    K_target = ti.Vector([intrinsics[1, k] for k in range(4)])
-    R = ti.Matrix([[T_target_source[i, j] for j in range(3)] for i in range(3)])
-    t = ti.Vector([T_target_source[i, 3] for i in range(3)])
+    R, t = T_target_source[:3, :3], T_target_source[:, 3]
+    limits = ti.Vector([gate, cosine, width, sigma, weight])
     rows, columns = (source.shape[0] + step - 1) // step, (source.shape[1] + step - 1) // step
     for launch in range(sums.shape[0] * CHUNK):
         if launch % CHUNK == 0:

@@ -95,10 +95,7 @@ def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
         normals = np.empty((*inverse.shape, 3), np.float32)
         images.estimate_normals(
             inverse,
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
+            camera.intrinsics,
             radius,
             edge_jump(camera),
             cosine,

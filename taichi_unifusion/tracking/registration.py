@@ -130,23 +130,26 @@ def _sum(
     from ..kernels import registration as kernels
 
     H, b, counts = np.zeros((6, 6)), np.zeros(6), np.zeros(kernels.SUMS)
-    limits = np.array(
-        [GATES[level], np.cos(np.radians(MAX_ANGLE)), ROBUST_WIDTH, sigma, weight], np.float32
-    )
     image = source.levels[level]
-    # every so manieth pixel of every so manieth row
+    # use every `step`-th pixel of every `step`-th row
     step = max(1, image.camera.width // USED_WIDTH)
     for target in targets:
-        limits[4] = weight if source.colored and target.pyramid.colored else 0.0
         other = target.pyramid.levels[level]
-        intrinsics = np.array(
-            [(c.fx, c.fy, c.cx, c.cy) for c in (image.camera, other.camera)], np.float32
-        )
-        T = np.ascontiguousarray((target.T_target_reference @ T_reference_source)[:3], np.float32)
         rows = -(-image.camera.height // step)
         sums = np.empty((-(-rows // kernels.BLOCK_ROWS), kernels.SUMS), np.float32)
         kernels.sum_normal_equations(
-            image.surfels, other.surfels, intrinsics, T, step, limits, sums
+            image.surfels,
+            other.surfels,
+            image.camera.intrinsics,
+            other.camera.intrinsics,
+            (target.T_target_reference @ T_reference_source)[:3],
+            step,
+            GATES[level],
+            float(np.cos(np.radians(MAX_ANGLE))),
+            ROBUST_WIDTH,
+            sigma,
+            weight if source.colored and target.pyramid.colored else 0.0,
+            sums,
         )
         total = sums.sum(axis=0, dtype=np.float64)
         A = se3.adjoint(target.T_target_reference)

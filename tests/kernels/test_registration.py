@@ -119,14 +119,12 @@ def test_sum_normal_equations(step, weight):
     source, target = surfels(3), surfels(4, 14, 18)
     K = np.array([(20, 21, 7.5, 5.5), (20, 20, 8.5, 6.5)], np.float32)
     T = se3.exp(np.array([0.01, -0.02, 0.005, 0.02, 0.01, -0.03]))
-    limits = np.array([0.04, 0.9, 1.0, 0.05, weight], np.float32)
+    limits = np.array([0.04, 0.9, 1.0, 0.05, weight], np.float32).astype(float).tolist()
     rows = -(-source.shape[0] // step)
     sums = np.empty((-(-rows // kernels.BLOCK_ROWS), kernels.SUMS), np.float32)
-    kernels.sum_normal_equations(
-        source, target, K, np.ascontiguousarray(T[:3], np.float32), step, limits, sums
-    )
+    kernels.sum_normal_equations(source, target, *K, T[:3], step, *limits, sums)
     H, b, counts = reference.sum_normal_equations(
-        source.astype(float), target.astype(float), *K.astype(float), T, step, *limits.astype(float)
+        source.astype(float), target.astype(float), *K.astype(float), T, step, *limits
     )
     total = sums.sum(axis=0, dtype=np.float64)
     np.testing.assert_allclose(
