@@ -35,7 +35,10 @@ ANCHORS = (20, 32, 64, 128, 256, 512, 1024)
 SEEDS = 5  # anchors are random: means and ranges over so many draws
 KEPT = (20, 256)  # the paper's choice of eigenpairs and anchors
 CELL = 0.0125  # [m] of marching cubes, whatever the voxel, so that voxels alone differ
-HEAD = "| variant | Accuracy % | Completeness % | F1 2.5 cm | F1 1 cm | Depth L1 cm | median cm | coverage | map MB | CPU ms |"
+HEAD = (
+    "| variant | Accuracy % | Completeness % | F1 2.5 cm | F1 1 cm | Depth L1 cm | median cm | coverage "
+    "| map MB | CPU ms |"
+)
 
 
 def reconstruct(config: uf.Config, scene: Scene) -> tuple[Mesh, float, float]:
@@ -65,8 +68,8 @@ def row(name: str, mesh: Mesh, megabytes: float, milliseconds: float, scene: Sce
         wide, strict = surface.scores
         shares = [f"{100 * x:.1f}" for x in (wide.precision, wide.recall, wide.f1, strict.f1)]
     return (
-        f"| {name} | {' | '.join(shares)} | {seen.depth_l1_cm:.2f} | {seen.depth_median_cm:.2f} | {seen.coverage:.3f} | "
-        f"{megabytes:.1f} | {milliseconds:.0f} |"
+        f"| {name} | {' | '.join(shares)} | {seen.depth_l1_cm:.2f} | {seen.depth_median_cm:.2f} "
+        f"| {seen.coverage:.3f} | {megabytes:.1f} | {milliseconds:.0f} |"
     )
 
 

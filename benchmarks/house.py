@@ -1,10 +1,11 @@
 """The furnished flat of AWS RoboMaker, rendered as RGB-D: its labels and the paths that a hand
 could carry a camera along.
 
-    python benchmarks/house.py PATH/aws-small-house --out frames     looks at the paths: clearance, steps, contact sheets
+    python benchmarks/house.py PATH/aws-small-house --out frames
     python benchmarks/house.py PATH/aws-small-house --paths tour --shown 207 290 456 --out docs
 
-`PATH` is the folder that holds house.glb and objects.json.
+The first looks at all paths: clearance, steps, contact sheets. `PATH` is the folder that holds
+house.glb and objects.json.
 """
 
 from __future__ import annotations
@@ -239,8 +240,9 @@ def main() -> None:
         T, free = dataset.T_world_camera, clearance(dataset)
         closed = np.concatenate([T, T[:1]])
         print(
-            f"{name}: {len(T)} frames, {steps(closed).sum():.1f} m, steps up to {100 * steps(closed).max():.1f} cm and "
-            f"{turns(closed).max():.1f} degrees, nearest surface {free.min():.2f} m (frame {free.argmin()})"
+            f"{name}: {len(T)} frames, {steps(closed).sum():.1f} m, "
+            f"steps up to {100 * steps(closed).max():.1f} cm and {turns(closed).max():.1f} degrees, "
+            f"nearest surface {free.min():.2f} m (frame {free.argmin()})"
         )
 
 

@@ -1,11 +1,11 @@
 """Properties: what a frame costs each map, what a second property adds, and how well images come
 back.
 
-    python benchmarks/properties.py cost                    # frames of 1280x720, as in the paper's Table VIII
-    python benchmarks/properties.py sharing                 # the time that a second property of three channels adds
-    python benchmarks/properties.py quality synthetic       # PSNR at held-out frames: colour, infrared-like, styles
-    python benchmarks/properties.py quality house PATH      # the same in the flat of aws-robomaker-small-house-world
-    python benchmarks/properties.py flicker house PATH --out docs/flicker.jpg    # change from view to view, with a picture
+    python benchmarks/properties.py cost                  # frames of 1280x720, as in the paper's Table VIII
+    python benchmarks/properties.py sharing               # the time that a second property of three channels adds
+    python benchmarks/properties.py quality synthetic     # PSNR at held-out frames: colour, infrared-like, styles
+    python benchmarks/properties.py quality house PATH    # the same in the flat of aws-robomaker-small-house-world
+    python benchmarks/properties.py flicker house PATH --out docs/flicker.jpg   # change between views; a picture
 
 Times are of this process's processors (CPU seconds by threads in use), because other programs share
 the machine; on a GPU, of the clock. Frames are loaded and property images made before; every map
@@ -171,8 +171,8 @@ def flicker(scene: str, path: str | None, frames: int, voxel_size: float, out: s
     views = look(open_scene(scene, path), frames, STYLES, voxel_size)
     for name, (images, renderings) in mean_changes(views).items():
         print(
-            f"{scene}, {100 * voxel_size:g} cm, {name}: its images change by {images:.2f} % of the range from view to view, "
-            f"the map's renderings by {renderings:.2f} %",
+            f"{scene}, {100 * voxel_size:g} cm, {name}: its images change by {images:.2f} % of the range "
+            f"from view to view, the map's renderings by {renderings:.2f} %",
             flush=True,
         )
     if out:

@@ -58,12 +58,13 @@ def main() -> None:
         mesh, frames, color=color.query, depth_min=settings.depth_min, depth_max=settings.depth_max
     )
     print(
-        f"depth L1 {result.depth_l1_cm:.3f} cm, median {result.depth_median_cm:.3f} cm, coverage {result.coverage:.3f}, "
-        f"PSNR {result.psnr_db:.3f} dB, SSIM {result.ssim:.3f}"
+        f"depth L1 {result.depth_l1_cm:.3f} cm, median {result.depth_median_cm:.3f} cm, "
+        f"coverage {result.coverage:.3f}, PSNR {result.psnr_db:.3f} dB, SSIM {result.ssim:.3f}"
     )
     print(
-        f"{len(frames)} frames on {live.description}: median {np.median(laps[1:]):.0f} ms a frame, first {laps[0]:.0f} ms, "
-        f"mesh in {to_mesh:.2f} s ({len(mesh.faces):,} triangles), {surface.memory_bytes / 2**20:.1f} + "
+        f"{len(frames)} frames on {live.description}: median {np.median(laps[1:]):.0f} ms a frame, "
+        f"first {laps[0]:.0f} ms, mesh in {to_mesh:.2f} s ({len(mesh.faces):,} triangles), "
+        f"{surface.memory_bytes / 2**20:.1f} + "
         f"{color.memory_bytes / 2**20:.1f} MB of maps, peak memory {peak:.2f} GB"
     )
 

@@ -77,7 +77,7 @@ def test_no_frame_is_both_fused_and_held_out(count, every):
     assert not set(fused) & set(between) and all(0 < i < count for i in between)
 
 
-def testworst_windows_hold_the_error():
+def test_worst_windows_hold_the_error():
     blank = np.zeros((480, 640, 3), np.uint8)
     frames = []
     for index, (y, x, size) in enumerate([(100, 200, 30), (300, 400, 60), (10, 20, 10)]):

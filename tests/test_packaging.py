@@ -34,14 +34,17 @@ IMPORT_NAMES = {
 }
 
 
-# --- K2: imports ----------------------------------------------------------------------------------------------------
+# ---- K2: imports ----
 
 
 def modules_after(code: str) -> tuple[set[str], float]:
     """Top-level modules that a fresh interpreter holds after `code`, and its wall time, start
     included [s].
     """
-    report = "import json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})), file=sys.stderr)"
+    report = (
+        "import json, sys\n"
+        "print(json.dumps(sorted({n.partition('.')[0] for n in sys.modules})), file=sys.stderr)"
+    )
     start = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-c", f"{code}\n{report}"],
@@ -112,7 +115,7 @@ def test_every_import_is_a_declared_dependency() -> None:
     assert not undeclared
 
 
-# --- K1: set-up, with the machine's Python and apt replaced by ones that lack something ---------------------------------
+# ---- K1: set-up, with the machine's Python and apt replaced by ones that lack something ----
 
 
 @pytest.fixture
@@ -198,7 +201,7 @@ def test_K1_finished_setup_is_left_alone_until_the_project_changes(bare_clone: P
     assert "pip called" in run_setup(bare_clone).stderr
 
 
-# --- what the repository holds ------------------------------------------------------------------------------------------
+# ---- what the repository holds ----
 
 
 @pytest.fixture(scope="module")

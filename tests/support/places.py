@@ -1,4 +1,4 @@
-"""The device that tests run on, and where they find this repository and recordings that it cannot hold."""
+"""The device that tests run on, and where the repository and real recordings are."""
 
 from __future__ import annotations
 

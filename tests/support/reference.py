@@ -517,7 +517,7 @@ def drop_flying_pixels(depth, jump, support):
     """
     height, width = depth.shape
     inverse = np.zeros(depth.shape)
-    for v, u in zip(*np.nonzero(depth)):
+    for v, u in zip(*np.nonzero(depth), strict=True):
         close = 0
         if 0 < v < height - 1 and 0 < u < width - 1:
             patch = depth[v - 1 : v + 2, u - 1 : u + 2]
