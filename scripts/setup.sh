@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Set-up behind `make demo` and `make test`: a virtual environment in .venv with this package, pytest and Open3D.
+# Set-up behind `make demo` and `make test`: a virtual environment in .venv with this package, what checks it, and Open3D.
 #
 # Does nothing when .venv already fits: same pyproject.toml, same script, same folder, a suitable Python.
 # PYTHON=... chooses the interpreter. Network: the package index through pip, and apt where a system package is missing.
@@ -103,7 +103,8 @@ else
 fi
 rm -f $STAMP
 say "installing packages into .venv; the first time this downloads about 0.8 GB"
-pip_install -e '.[test]' || die "pip could not install the packages (its own message is above); check the network, then run the command again."
+pip_install -e '.[dev]' ||
+    die "pip could not install the packages (its own message is above); check the network, then run the command again."
 add_open3d
 fingerprint > $STAMP
 say "ready"
