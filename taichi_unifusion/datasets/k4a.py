@@ -28,11 +28,11 @@ from ..errors import DatasetError, FrameError, MissingDependency, check_choice
 from ..files.images import decode_color, depth_to_metres
 from ..files.trajectories import Pose, read_stamped_poses
 from ..geometry.time_stamps import check_max_difference, nearest
-from ..types import Frame
+from ..types import Frame, PinholeCamera
 from .base import Dataset
 from .checks import pose_warnings
 from .k4a_calibration import read_calibration
-from .lens_camera import color_for_depth, splat_depth
+from .lens_camera import LensCamera, color_for_depth, splat_depth
 
 DEPTH_SCALE = 1000.0
 TRACKS = ("DEPTH", "COLOR", "IR")  # titles
@@ -114,9 +114,17 @@ class K4aFile(Dataset):
             )
 
     @property
-    def camera(self):
+    def camera(self) -> PinholeCamera:
         """The pinhole camera of the frames."""
-        return (self.calibration.color if self.align == "color" else self.calibration.depth).pinhole
+        lens = self._color_lens() if self.align == "color" else self.calibration.depth
+        return lens.pinhole
+
+    def _color_lens(self) -> LensCamera:
+        """The colour camera; a recording that shows colour, or is aligned to it, has one."""
+        lens = self.calibration.color
+        if lens is None:
+            raise DatasetError(f"{self.path}: {CALIBRATION} knows no colour camera")
+        return lens
 
     def __len__(self) -> int:
         return len(self.captures)
@@ -149,7 +157,7 @@ class K4aFile(Dataset):
         infrared = cameras.depth.undistort(infrared, camera)
         if color is not None:
             color, seen = color_for_depth(
-                color, cameras.color, depth, camera, cameras.T_color_depth
+                color, self._color_lens(), depth, camera, cameras.T_color_depth
             )
             depth[~seen] = 0
         return depth, color, infrared
@@ -157,7 +165,7 @@ class K4aFile(Dataset):
     def _to_color(
         self, depth: NDArray, color: NDArray | None, infrared: NDArray
     ) -> tuple[NDArray, NDArray | None, NDArray]:
-        cameras, camera = self.calibration, self.camera
+        cameras, lens, camera = self.calibration, self._color_lens(), self.camera
         own = cameras.depth.pinhole
         factor = int(np.ceil(FINER * max(camera.fx / own.fx, camera.fy / own.fy)))
         finer = own.resized(own.width * factor, own.height * factor)
@@ -168,8 +176,8 @@ class K4aFile(Dataset):
             camera,
             cameras.T_color_depth,
         )
-        depth[~cameras.color.sees(camera)] = 0
-        return depth, None if color is None else cameras.color.undistort(color, camera), infrared
+        depth[~lens.sees(camera)] = 0
+        return depth, None if color is None else lens.undistort(color, camera), infrared
 
     def _read(self, capture: Capture, where: str) -> dict[str, NDArray]:
         """The images of a frame by title of their track, as they are in the file."""

@@ -85,7 +85,7 @@ def _undistortion(
     )
     beyond = np.hypot(*cv2.split(camera_rays(target))[:2]) >= lens.max_radius
     map_x[beyond] = map_y[beyond] = -2
-    return map_x, map_y
+    return np.asarray(map_x, np.float32), np.asarray(map_y, np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -137,7 +137,7 @@ def color_for_depth(
     width, height = color_camera.size
     inside = (columns > -0.5) & (rows > -0.5) & (columns < width - 0.5) & (rows < height - 0.5)
     # the rim mixes with black
-    covered = cv2.erode(np.uint8(lens.sees(color_camera)), np.ones((3, 3)))
+    covered = cv2.erode(lens.sees(color_camera).astype(np.uint8), np.ones((3, 3)))
     covered = cv2.remap(covered, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
     known = inside & (depth > 0)
     # pixels of the colour camera: wide enough to hold a reading each
@@ -150,9 +150,8 @@ def color_for_depth(
     np.minimum.at(nearest, (at[0][known], at[1][known]), z[known])
     seen = known & (covered > 0) & (z <= (1 + HIDDEN) * cv2.erode(nearest, np.ones((3, 3)))[at])
     undistorted = lens.undistort(color, color_camera)
-    return cv2.remap(
-        undistorted, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
-    ), seen
+    moved = cv2.remap(undistorted, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return np.asarray(moved, np.uint8), seen
 
 
 def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -160,9 +159,10 @@ def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     empty = (depth <= 0).astype(np.uint8)
     if not empty.any() or empty.all():
         return depth
-    _, labels = cv2.distanceTransformWithLabels(
+    _, found = cv2.distanceTransformWithLabels(
         empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    labels = np.asarray(found, np.int32)  # of the nearest pixel with a reading
     readings = np.zeros(labels.max() + 1, np.float32)
     readings[labels[empty == 0]] = depth[empty == 0]
     return readings[labels]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import PoseError
 from ..types import Frame
 
 GRID = 48  # points along each image axis
@@ -23,7 +24,7 @@ MIN_MOTION = 0.05, np.radians(3)  # [m], [rad]: with less, all readings agree
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 READINGS = {
-    "world-to-camera matrices: invert them": lambda T: np.linalg.inv(T),
+    "world-to-camera matrices: invert them": np.linalg.inv,
     "OpenGL's axes (y up, z backward): multiply them from the right by diag(1, -1, -1, 1)": lambda T: (
         T @ FLIP_YZ
     ),
@@ -35,9 +36,15 @@ READINGS = {
 
 def has_moved(a: Frame, b: Frame) -> bool:
     """Whether the poses of two frames differ enough to tell readings apart."""
-    T_a_b = np.linalg.inv(a.T_world_camera) @ b.T_world_camera
+    T_a_b = np.linalg.inv(_pose_of(a)) @ _pose_of(b)
     angle = np.arccos(np.clip((np.trace(T_a_b[:3, :3]) - 1) / 2, -1, 1))
     return bool(np.linalg.norm(T_a_b[:3, 3]) > MIN_MOTION[0] or angle > MIN_MOTION[1])
+
+
+def _pose_of(frame: Frame) -> NDArray[np.float64]:
+    if frame.T_world_camera is None:
+        raise PoseError(f"{frame.label}: has no pose to judge")
+    return frame.T_world_camera
 
 
 def agreement(a: Frame, b: Frame, T_b_a: NDArray[np.float64]) -> tuple[float, int]:
@@ -61,12 +68,11 @@ def guess_pose_convention(a: Frame, b: Frame) -> tuple[bool, str | None]:
     """Whether this pair of frames decides it, and a sentence if another reading of the poses fits
     far better.
     """
-    given, seen_as_given = agreement(a, b, np.linalg.inv(b.T_world_camera) @ a.T_world_camera)
+    T_world_a, T_world_b = _pose_of(a), _pose_of(b)
+    given, seen_as_given = agreement(a, b, np.linalg.inv(T_world_b) @ T_world_a)
     scores = {}
     for reading, read in READINGS.items():
-        share, seen = agreement(
-            a, b, np.linalg.inv(read(b.T_world_camera)) @ read(a.T_world_camera)
-        )
+        share, seen = agreement(a, b, np.linalg.inv(read(T_world_b)) @ read(T_world_a))
         scores[reading] = share if seen >= MIN_POINTS else 0.0
     reading, best = max(scores.items(), key=lambda item: item[1])
     if best < max(given + CLEARLY_BETTER, PLAUSIBLE):

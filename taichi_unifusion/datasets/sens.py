@@ -1,10 +1,13 @@
 """ScanNet's `.sens` container, version 4: a header, then one record a frame; little-endian
 throughout.
 
-    u32 version, u64 length + sensor name, 4 x (4x4 f32): intrinsic and extrinsic of colour, intrinsic and extrinsic of depth,
-    i32 colour compression (0 raw RGB, 1 PNG, 2 JPEG), i32 depth compression (0 raw u16, 1 zlib u16, 2 Occipital's own),
-    u32 colour width, height, u32 depth width, height, f32 depth units a metre, u64 number of frames;
-    a frame: 4x4 f32 camera-to-world, u64 colour and u64 depth time stamp [us], u64 colour and u64 depth bytes, the two images.
+    u32 version, u64 length + sensor name,
+    4 x (4x4 f32): intrinsic and extrinsic of colour, intrinsic and extrinsic of depth,
+    i32 colour compression (0 raw RGB, 1 PNG, 2 JPEG),
+    i32 depth compression (0 raw u16, 1 zlib u16, 2 Occipital's own),
+    u32 colour width, height, u32 depth width, height, f32 depth units a metre, u64 frames;
+    a frame: 4x4 f32 camera-to-world, u64 colour and u64 depth time stamp [us],
+    u64 colour and u64 depth bytes, the two images.
 
 Opening walks the records without reading images; every size is judged before anything is allocated
 for it.

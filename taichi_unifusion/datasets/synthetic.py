@@ -118,12 +118,14 @@ def look_at(eye: Sequence[float], target: Sequence[float]) -> NDArray[np.float64
     """T_world_camera of an upright camera at `eye` with `target` on its optical axis; both in world
     [m].
     """
-    eye = np.asarray(eye, dtype=float)
-    forward = (target - eye) / np.linalg.norm(target - eye)
+    forward = np.subtract(target, eye)
+    forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     T_world_camera = np.eye(4)
-    T_world_camera[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
+    T_world_camera[:3] = np.stack(
+        [right, np.cross(forward, right), forward, np.asarray(eye)], axis=1
+    )
     return T_world_camera
 
 
@@ -205,7 +207,9 @@ class Scene:
     def _maps(self, T_world_camera: NDArray) -> NDArray[np.float32]:
         return np.ascontiguousarray((self.T_local_world @ T_world_camera)[:, :3], np.float32)
 
-    def _cull(self, camera: PinholeCamera, T_world_camera: NDArray):
+    def _cull(
+        self, camera: PinholeCamera, T_world_camera: NDArray
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]]:
         """Nearest depth [m] of every primitive, (P,), and which may show in which tile: row starts,
         members nearest first.
         """
@@ -256,10 +260,10 @@ class Scene:
             if top > 0.03 and bottom < 1.0:  # neither rugs nor what hangs on the walls
                 cover[int(bottom > 0.15)][np.maximum(np.abs(u), np.abs(v)) <= 1] = 1
         contact, above = (
-            cv2.GaussianBlur(c, None, s / GROUND_STEP)
+            cv2.GaussianBlur(np.asarray(c), (0, 0), s / GROUND_STEP)
             for c, s in zip(cover, (0.05, 0.16), strict=True)
         )
-        return np.ascontiguousarray((1 - 0.45 * contact) * (1 - 0.4 * above))
+        return np.ascontiguousarray((1 - 0.45 * contact) * (1 - 0.4 * above), np.float32)
 
 
 def _intrinsics(camera: PinholeCamera):

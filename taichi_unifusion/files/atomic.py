@@ -26,13 +26,13 @@ _REASONS = {
 }
 
 
-def file_error(verb: str, path: str | os.PathLike, error: OSError) -> FileError:
+def file_error(verb: str, path: str | os.PathLike[str], error: OSError) -> FileError:
     """The FileError that says what could not be done where, and why."""
-    reason = _REASONS.get(error.errno) or error.strerror or str(error) or type(error).__name__
+    reason = _REASONS.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
     return FileError(f"{path}: cannot {verb}: {reason}")
 
 
-def read_bytes(path: str | os.PathLike) -> bytes:
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """The whole content of a file; raises FileError where it is missing or cannot be read."""
     path = Path(path)
     try:
@@ -43,7 +43,7 @@ def read_bytes(path: str | os.PathLike) -> bytes:
         raise file_error("read", path, error) from error
 
 
-def check_writable(folder: str | os.PathLike) -> Path:
+def check_writable(folder: str | os.PathLike[str]) -> Path:
     """Create `folder` where needed and write a test file in it; raises FileError that says why it
     cannot hold results.
     """
@@ -61,7 +61,7 @@ def check_writable(folder: str | os.PathLike) -> Path:
 
 
 @contextmanager
-def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path in the folder of `path`; what was written there replaces `path` when
     the block ends well.
 
@@ -84,12 +84,12 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
     except OSError as error:
         raise file_error("write", path, error) from error
     finally:
-        # it is gone when all went well, and was never there when the folder is none
+        # already renamed on success; never made if the folder does not exist
         with suppress(OSError):
             temporary.unlink()
 
 
-def write_text(path: str | os.PathLike, text: str) -> None:
+def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file atomically; raises FileError."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -38,13 +38,13 @@ def decode_color(data: bytes, where: str, *, drop_alpha: bool = False) -> NDArra
         )
     channels = 1 if image.ndim == 2 else image.shape[2]
     if channels == 4 and drop_alpha:
-        return cv2.cvtColor(image, cv2.COLOR_BGRA2RGB)
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGB), np.uint8)
     if channels != 3:
         advice = (
             "pass drop_alpha=True to ignore the fourth" if channels == 4 else "convert it to RGB"
         )
         raise FrameError(f"{where}: colour must have 3 channels, got {channels}; {advice}")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def read_depth(
@@ -192,7 +192,7 @@ def _open_npy(path: Path) -> NDArray:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError:
         raise FrameError(f"{path}: no such file") from None
-    except Exception as error:  # NumPy parses the header as Python text: tokenizer errors and others escape from it
+    except Exception as error:  # NumPy parses the header as Python: any error escapes
         raise FrameError(f"{path}: not a readable .npy array ({error})") from error
     if not isinstance(array, np.ndarray) or array.size > MAX_PIXELS:
         raise FrameError(f"{path}: not one .npy array of at most {MAX_PIXELS} pixels")

@@ -15,8 +15,9 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +59,7 @@ _FOREIGN = {  # how other files begin, for the message
 
 
 def write_map(
-    path: str | os.PathLike, tensors: dict[str, NDArray], manifest: dict[str, Any]
+    path: str | os.PathLike[str], tensors: dict[str, NDArray], manifest: dict[str, Any]
 ) -> None:
     """Write arrays and a manifest of JSON values atomically.
 
@@ -101,7 +102,7 @@ def write_map(
             file.write(_bytes_of(array))
 
 
-def read_map(path: str | os.PathLike) -> tuple[dict[str, NDArray], dict[str, Any]]:
+def read_map(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """All arrays and the manifest (with the container's own keys, see `write_map`), each checked
     against its sum.
 
@@ -125,7 +126,7 @@ def read_map(path: str | os.PathLike) -> tuple[dict[str, NDArray], dict[str, Any
     return tensors, manifest
 
 
-def read_manifest(path: str | os.PathLike) -> dict[str, Any]:
+def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The manifest alone, checked against its sum and the file's size; no tensor is read. Errors as
     in `read_map`.
     """
@@ -147,13 +148,13 @@ def _storable(name: str, array: NDArray) -> NDArray:
     return little
 
 
-def _bytes_of(array: NDArray) -> NDArray[np.uint8]:
+def _bytes_of(array: NDArray[Any]) -> memoryview:
     """The memory of a contiguous array as bytes, not copied."""
-    return array.reshape(-1).view(np.uint8)
+    return array.reshape(-1).view(np.uint8).data
 
 
 @contextmanager
-def _open(path: str | os.PathLike) -> Iterator[BinaryIO]:
+def _open(path: str | os.PathLike[str]) -> Iterator[BufferedReader]:
     """The open file; what the system says while it is read becomes a FileError."""
     if Path(path).exists() and not Path(path).is_file():
         raise FileError(f"{path}: is not a regular file, so not a map file")
@@ -168,7 +169,9 @@ def _open(path: str | os.PathLike) -> Iterator[BinaryIO]:
         raise file_error("read", path, error) from error
 
 
-def _read_header(file: BinaryIO, path: str | os.PathLike) -> tuple[Layout, dict[str, Any]]:
+def _read_header(
+    file: BufferedReader, path: str | os.PathLike[str]
+) -> tuple[Layout, dict[str, Any]]:
     """Type and shape of every tensor in the order of their bytes, and the manifest, all found
     consistent.
     """
@@ -198,7 +201,7 @@ def _read_header(file: BinaryIO, path: str | os.PathLike) -> tuple[Layout, dict[
     return tensors, manifest
 
 
-def _check_manifest(metadata: dict[str, Any], path: str | os.PathLike) -> dict[str, Any]:
+def _check_manifest(metadata: dict[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
     """The parsed manifest: its sum, format and version are right and it describes tensors."""
     text = metadata[_MANIFEST]
     if (
@@ -237,7 +240,7 @@ def _check_manifest(metadata: dict[str, Any], path: str | os.PathLike) -> dict[s
     return manifest
 
 
-def _check_layout(header: dict[str, Any], available: int, path: str | os.PathLike) -> Layout:
+def _check_layout(header: dict[str, Any], available: int, path: str | os.PathLike[str]) -> Layout:
     """Type and shape of every tensor: sizes agree with places, which cover the `available` bytes
     without gap or overlap.
     """
@@ -297,7 +300,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
-def _what_it_is(file: BinaryIO) -> str:
+def _what_it_is(file: BufferedReader) -> str:
     """Why this is no map file, in words."""
     file.seek(0)
     start = file.read(8)

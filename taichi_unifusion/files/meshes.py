@@ -61,4 +61,4 @@ def _encode_with_trimesh(path: Path, mesh: Triangles) -> bytes:
         vertex_colors=None if color is None else color_to_uint8(color),
     )
     content = exported.export(file_type=path.suffix.lower()[1:], include_normals=has_normals)
-    return content.encode() if isinstance(content, str) else content
+    return content.encode() if isinstance(content, str) else bytes(content)

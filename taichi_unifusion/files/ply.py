@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,9 @@ def write_ply(file: BinaryIO, mesh: Triangles) -> None:
     a comment in the header says which, so that reading gives the same attributes. Raises InputError
     for names that PLY cannot hold.
     """
-    columns = [("<f4", ("x", "y", "z"), mesh.vertices)]
+    columns: list[tuple[str, tuple[str, ...], NDArray[Any]]] = [
+        ("<f4", ("x", "y", "z"), mesh.vertices)
+    ]
     if mesh.normals is not None:
         columns.append(("<f4", ("nx", "ny", "nz"), mesh.normals))
     comments = []
@@ -91,7 +93,7 @@ def write_ply(file: BinaryIO, mesh: Triangles) -> None:
     file.write(("\n".join(header) + "\n").encode("ascii"))
     for table in (rows, triangles):
         if len(table):
-            file.write(table.view(np.uint8))
+            file.write(table.view(np.uint8).data)
 
 
 def property_names(name: str, columns: int) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,11 +241,13 @@ def _vertex_data(
     """
     rest = dict(columns)
 
-    def take(*names: str) -> NDArray[np.float32] | None:
-        """These columns side by side, each handed out once; None unless all are there."""
-        if not all(key in rest for key in names):
-            return None
+    def taken(*names: str) -> NDArray[np.float32]:
+        """These columns side by side, each handed out once."""
         return np.stack([rest.pop(key) for key in names], axis=1).astype(np.float32)
+
+    def take(*names: str) -> NDArray[np.float32] | None:
+        """These columns, or None unless all are there."""
+        return taken(*names) if all(key in rest for key in names) else None
 
     vertices, normals, color = (
         take("x", "y", "z"),
@@ -253,15 +256,19 @@ def _vertex_data(
     )
     if vertices is None:
         raise FileError(f"{name}: the PLY file has no vertices with x, y and z")
-    values = {} if color is None else {"color": color / np.float32(color_range)}
+    values: dict[str, NDArray[np.float32]] = {}
+    if color is not None:
+        values["color"] = color / np.float32(color_range)
     for attribute, count in attributes.items():
         group = take(*property_names(attribute, count)) if 0 < count <= len(rest) else None
         if group is not None:
             values[attribute] = group
-    return vertices, normals, values | {key: take(key) for key in list(rest)}
+    return vertices, normals, values | {key: taken(key) for key in list(rest)}
 
 
-def _triangles(polygons, count: int, name: str) -> NDArray[np.int32]:
+def _triangles(
+    polygons: NDArray[Any] | list[NDArray[Any]], count: int, name: str
+) -> NDArray[np.int32]:
     """Faces (F, 3) of polygons, which index `count` vertices; a polygon of k corners is a fan of k
     - 2 triangles.
     """

@@ -6,6 +6,7 @@ import os
 from typing import Any
 
 import yaml
+from yaml.error import MarkedYAMLError
 
 from ..errors import InputError
 from .atomic import read_bytes
@@ -46,7 +47,7 @@ class _StrictLoader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = str(key_node.value)
             if key in seen:
-                raise yaml.constructor.ConstructorError(
+                raise MarkedYAMLError(
                     None, None, f"key '{key}' is given twice", key_node.start_mark
                 )
             seen.add(key)
@@ -65,4 +66,4 @@ def _check_plain(data: bytes) -> None:
         elif depth > MAX_NESTING:
             problem = f"more than {MAX_NESTING} nested values are not allowed here"
         if problem:
-            raise yaml.composer.ComposerError(None, None, problem, event.start_mark)
+            raise MarkedYAMLError(None, None, problem, event.start_mark)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,8 +37,8 @@ def associate(
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
-def nearest(stamps: NDArray[np.float64], query: NDArray[np.float64]) -> NDArray[np.int64]:
-    """For each query the index of the nearest of the sorted, non-empty `stamps`."""
+def nearest(stamps: NDArray[Any], query: NDArray[Any]) -> NDArray[np.int64]:
+    """For each query the index of the nearest of the sorted, non-empty `stamps`, in any unit."""
     right = np.clip(np.searchsorted(stamps, query), 1, max(len(stamps) - 1, 1))
     left = right - 1
     right = np.minimum(right, len(stamps) - 1)
