@@ -1,34 +1,99 @@
 """Poses for frames (Sec. V-A.1): as given, from a trajectory file, refined, or found from the
 frames alone.
 
-tracker = make_tracker("rgbd", TrackingSettings())
-result = track_sequence(frames, tracker)       # a TrackingResult: poses, fitness, verdicts
-pipeline.run(PosedFrames(frames, result))      # the map is built from the final poses
+posed = track(frames, mode="rgbd")             # the frames with the poses found: PosedFrames
+print(posed.tracking.counts)                   # a TrackingResult: poses, fitness, verdicts
+pipeline.run(posed[::5])                       # the map is built from the final poses
 """
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from ..errors import InputError, check_choice
+from ..errors import DatasetError, InputError, check_choice
 from ..preprocessing import PreprocessSettings
-from .base import TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
+from .base import (
+    PoseSource,
+    TrackedFrame,
+    Tracker,
+    TrackingResult,
+    TrackingSettings,
+    Verdict,
+)
 
-MODES = ("given", "external", "internal", "rgbd")
+if TYPE_CHECKING:
+    from ..datasets import Dataset
+    from .sequence import PosedFrames
+
+Mode = Literal["given", "external", "internal", "rgbd"]
+
+TRACKERS: dict[Mode, tuple[str, str]] = {  # name -> module here, class
+    "given": ("given", "GivenPoses"),
+    "external": ("external", "ExternalPoseTracker"),
+    "internal": ("internal", "InternalTracker"),
+    "rgbd": ("rgbd", "RgbdTracker"),
+}
 
 __all__ = [
-    "MODES",
+    "TRACKERS",
+    "Mode",
+    "PoseSource",
     "TrackedFrame",
     "Tracker",
     "TrackingResult",
     "TrackingSettings",
     "Verdict",
+    "check_poses",
     "make_tracker",
+    "track",
 ]
+
+logger = logging.getLogger(__name__)
+
+
+def track(
+    frames: Dataset,
+    settings: TrackingSettings | None = None,
+    preprocess: PreprocessSettings | None = None,
+    *,
+    mode: Mode = "rgbd",
+    trajectory: str | Path | None = None,
+    interpolate: bool = False,
+    max_difference: float | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    on_frame: Callable[[int, int], None] = lambda done, total: None,
+) -> PosedFrames:
+    """The frames with their final poses; `posed.tracking` says what was found.
+
+    Track all frames of a recording and thin them afterwards: small steps are easier. `trajectory`
+    is the file or folder for external, and for internal instead of given poses; `interpolate` fills
+    short gaps in it, `max_difference` [s] is how far a pose may be from its frame. `stop` is asked
+    before every frame, `on_frame` told how many of them are done.
+
+    Raises InputError for an unknown mode or a trajectory that is missing or not used, DatasetError
+    where there are no poses and the mode needs them.
+    """
+    from .sequence import PosedFrames, track_sequence
+
+    check_poses(frames, mode, trajectory)
+    tracker = make_tracker(
+        mode,
+        settings,
+        preprocess,
+        trajectory=trajectory,
+        interpolate=interpolate,
+        max_difference=max_difference,
+    )
+    logger.info("tracking: %s", mode)
+    return PosedFrames(frames, track_sequence(frames, tracker, stop=stop, on_frame=on_frame))
 
 
 def make_tracker(
-    mode: str,
+    mode: Mode,
     settings: TrackingSettings | None = None,
     preprocess: PreprocessSettings | None = None,
     *,
@@ -36,44 +101,27 @@ def make_tracker(
     interpolate: bool = False,
     max_difference: float | None = None,
 ) -> Tracker:
-    """The tracker of that mode; `trajectory` is the file or folder for external, and for internal
-    instead of given poses.
-
-    Raises InputError for an unknown mode or a trajectory that is missing or not used, DatasetError
-    where it holds no poses.
-    """
-    check_choice("tracking", mode, MODES)
-    if mode == "external" and trajectory is None:
-        raise InputError("tracking: external needs a trajectory file (--trajectory FILE)")
-    if mode in ("given", "rgbd") and (trajectory is not None or interpolate):
+    """The tracker of that mode; arguments and errors as for `track`."""
+    kind = _kind(mode)
+    if not kind.reads_trajectory and (trajectory is not None or interpolate):
+        readers = [name for name in TRACKERS if _kind(name).reads_trajectory]
         raise InputError(
-            f"tracking: {mode} reads no trajectory file; use external or internal with it"
+            f"tracking: {mode} reads no trajectory file; use {' or '.join(readers)} with it"
         )
-    if mode == "rgbd":
-        from .rgbd import RgbdTracker
-
-        return RgbdTracker(settings, preprocess)
-    prior = _prior(trajectory, interpolate, max_difference)
-    if mode == "internal":
-        from .internal import InternalTracker
-
-        return InternalTracker(prior, settings, preprocess)
-    return prior
+    source = PoseSource(trajectory, interpolate, max_difference)
+    return kind.make(settings or TrackingSettings(), preprocess or PreprocessSettings(), source)
 
 
-def _prior(
-    trajectory: str | Path | None, interpolate: bool, max_difference: float | None
-) -> Tracker:
-    """Poses as somebody else gives them."""
-    if trajectory is None:
-        from .given import GivenPoses
+def check_poses(frames: Dataset, mode: Mode, trajectory: str | Path | None = None) -> None:
+    """Raise DatasetError where the mode needs the recording's poses and there are none."""
+    if frames.no_poses and trajectory is None and _kind(mode).uses_given_poses:
+        raise DatasetError(
+            f"{frames.no_poses}, so the frames have no poses; find them from the frames alone with "
+            "--tracking rgbd, or take another program's with --tracking external --trajectory FILE"
+        )
 
-        return GivenPoses()
-    from .external import MAX_DIFFERENCE, ExternalPoseTracker
-    from .trajectory_files import read_poses
 
-    return ExternalPoseTracker(
-        read_poses(trajectory),
-        interpolate,
-        MAX_DIFFERENCE if max_difference is None else max_difference,
-    )
+def _kind(mode: Mode) -> type[Tracker]:
+    check_choice("tracking", mode, TRACKERS)
+    module, name = TRACKERS[mode]
+    return getattr(import_module(f".{module}", __package__), name)

@@ -7,15 +7,60 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, PoseError
+from ..preprocessing import PreprocessSettings
 from ..types import Frame, Trajectory
 
-Mode = Literal["given", "external", "internal", "rgbd"]
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """How poses are found and refined."""
+
+    photometric_weight: float = 0.1
+    """Weight of colour against geometry when frames are aligned; it decides what geometry leaves
+    open. 0: geometry alone.
+    """
+    depth_max: float = 6.0
+    """Farthest reading that tracking uses, in metres."""
+    keyframe_distance: float = 0.10
+    """A new keyframe is made when the camera is this far from the last one, in metres ..."""
+    keyframe_angle: float = 7.0
+    """... or has turned by this angle, in degrees ..."""
+    keyframe_fitness: float = 0.8
+    """... or less than this share of the frame lies on it."""
+    window: int = 1
+    """How many recent keyframes a frame is aligned to; internal tracking uses at least 3."""
+    loops: bool = True
+    """Recognise places seen before, and distribute what was drifted over the trajectory."""
+    prior_distance: float = 0.10
+    """internal: a refinement that moves a pose further than this from the given one, in metres, is
+    not trusted ...
+    """
+    prior_angle: float = 5.0
+    """... nor one that turns it by more than this, in degrees."""
+
+    def __post_init__(self) -> None:
+        if not self.depth_max > 0.1:
+            raise InputError(f"tracking: depth_max must be above 0.1 m, got {self.depth_max}")
+        positive = ("keyframe_distance", "keyframe_angle", "prior_distance", "prior_angle")
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise InputError(f"tracking: {name} must be positive, got {getattr(self, name)}")
+        if (
+            not 0 <= self.photometric_weight <= 100
+            or not 0 < self.keyframe_fitness < 1
+            or self.window < 1
+        ):
+            raise InputError(
+                f"tracking: need photometric_weight in 0..100, keyframe_fitness in (0, 1) and window >= 1, got "
+                f"{self.photometric_weight}, {self.keyframe_fitness} and {self.window}"
+            )
 
 
 class Verdict(StrEnum):
@@ -78,14 +123,33 @@ class TrackingResult:
         )
 
 
+@dataclass(frozen=True)
+class PoseSource:
+    """Where poses come from that are not the recording's, and how they are joined to frames."""
+
+    trajectory: str | Path | None = None  # file or folder
+    interpolate: bool = False  # between its poses, over short gaps
+    max_difference: float | None = None  # [s] between a frame and its pose; None: the usual
+
+
 class Tracker(ABC):
     """Poses for frames that come in order: `track` each of them, then `finish` once.
 
     A tracker for another source of poses (a SLAM system, a ROS topic) is one more class like this
-    one.
+    one, and a line in `TRACKERS`. `warnings` holds sentences on what was odd but usable; they are
+    said when tracking starts.
     """
 
     uses_given_poses = True  # False: frames are handed over without the poses of their recording
+    reads_trajectory = False  # whether it makes use of a PoseSource
+    warnings: tuple[str, ...] = ()
+
+    @classmethod
+    @abstractmethod
+    def make(
+        cls, settings: TrackingSettings, preprocess: PreprocessSettings, source: PoseSource
+    ) -> Self:
+        """A tracker that has seen nothing yet; takes what it needs."""
 
     @abstractmethod
     def track(self, frame: Frame) -> TrackedFrame:
@@ -101,48 +165,3 @@ class Tracker(ABC):
     @abstractmethod
     def finish(self) -> TrackingResult:
         """All frames that were tracked, in order, with their final poses."""
-
-
-@dataclass(frozen=True)
-class TrackingSettings:
-    """How poses are found and refined."""
-
-    photometric_weight: float = 0.1
-    """Weight of colour against geometry when frames are aligned; it decides what geometry leaves
-    open. 0: geometry alone.
-    """
-    depth_max: float = 6.0
-    """Farthest reading that tracking uses, in metres."""
-    keyframe_distance: float = 0.10
-    """A new keyframe is made when the camera is this far from the last one, in metres ..."""
-    keyframe_angle: float = 7.0
-    """... or has turned by this angle, in degrees ..."""
-    keyframe_fitness: float = 0.8
-    """... or less than this share of the frame lies on it."""
-    window: int = 1
-    """How many recent keyframes a frame is aligned to; internal tracking uses at least 3."""
-    loops: bool = True
-    """Recognise places seen before, and distribute what was drifted over the trajectory."""
-    prior_distance: float = 0.10
-    """internal: a refinement that moves a pose further than this from the given one, in metres, is
-    not trusted ...
-    """
-    prior_angle: float = 5.0
-    """... nor one that turns it by more than this, in degrees."""
-
-    def __post_init__(self) -> None:
-        if not self.depth_max > 0.1:
-            raise InputError(f"tracking: depth_max must be above 0.1 m, got {self.depth_max}")
-        positive = ("keyframe_distance", "keyframe_angle", "prior_distance", "prior_angle")
-        for name in positive:
-            if not getattr(self, name) > 0:
-                raise InputError(f"tracking: {name} must be positive, got {getattr(self, name)}")
-        if (
-            not 0 <= self.photometric_weight <= 100
-            or not 0 < self.keyframe_fitness < 1
-            or self.window < 1
-        ):
-            raise InputError(
-                f"tracking: need photometric_weight in 0..100, keyframe_fitness in (0, 1) and window >= 1, got "
-                f"{self.photometric_weight}, {self.keyframe_fitness} and {self.window}"
-            )

@@ -9,13 +9,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DatasetError
+from ..errors import DatasetError, InputError
 from ..files.frame_files import number_of
 from ..geometry import se3
 from ..geometry.time_stamps import check_max_difference, nearest
+from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from .base import TrackedFrame, Tracker, TrackingResult, Verdict
-from .trajectory_files import ExternalPoses
+from .base import PoseSource, TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
+from .trajectory_files import ExternalPoses, read_poses
 
 MAX_DIFFERENCE = 0.02  # [s] between a frame and its pose, as TUM's benchmark has it
 # [s] or frames; a longer gap is not interpolated: nobody knows what the camera did in it
@@ -26,6 +27,20 @@ class ExternalPoseTracker(Tracker):
     """Takes poses from a file; frames without one have none, unless `interpolate` fills short gaps."""
 
     uses_given_poses = False
+    reads_trajectory = True
+
+    @classmethod
+    def make(
+        cls, settings: TrackingSettings, preprocess: PreprocessSettings, source: PoseSource
+    ) -> ExternalPoseTracker:
+        if source.trajectory is None:
+            raise InputError("tracking: external needs a trajectory file (--trajectory FILE)")
+        difference = source.max_difference
+        return cls(
+            read_poses(source.trajectory),
+            source.interpolate,
+            MAX_DIFFERENCE if difference is None else difference,
+        )
 
     def __init__(
         self,
@@ -35,6 +50,7 @@ class ExternalPoseTracker(Tracker):
     ) -> None:
         check_max_difference(max_difference)
         self.poses, self.interpolate, self.max_difference = poses, interpolate, max_difference
+        self.warnings = poses.warnings
         self.frames: list[TrackedFrame] = []
         self.keys: list[float] = []  # that frames were looked for under
 

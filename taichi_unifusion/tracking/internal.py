@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from .base import TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
+from .base import PoseSource, TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
+from .external import ExternalPoseTracker
+from .given import GivenPoses
 from .odometry import KeyframeOdometry, View
 from .pose_graph import Edge, Prior
 from .registration import Registration
@@ -29,6 +31,15 @@ class InternalTracker(Tracker):
     globally consistent trajectory stays so.
     """
 
+    reads_trajectory = True
+
+    @classmethod
+    def make(
+        cls, settings: TrackingSettings, preprocess: PreprocessSettings, source: PoseSource
+    ) -> InternalTracker:
+        kind = GivenPoses if source.trajectory is None else ExternalPoseTracker
+        return cls(kind.make(settings, preprocess, source), settings, preprocess)
+
     def __init__(
         self,
         prior: Tracker,
@@ -36,7 +47,7 @@ class InternalTracker(Tracker):
         preprocess: PreprocessSettings | None = None,
     ) -> None:
         self.prior, self.settings = prior, settings or TrackingSettings()
-        self.uses_given_poses = prior.uses_given_poses
+        self.uses_given_poses, self.warnings = prior.uses_given_poses, prior.warnings
         self.odometry = KeyframeOdometry(self.settings, preprocess or PreprocessSettings())
         self.T_world_prior: list[NDArray[np.float64]] = []  # of every keyframe, as given
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from .base import TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
+from .base import PoseSource, TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
 from .features import locate, most_similar
 from .loop_closure import believable
 from .odometry import MIN_AGREEMENT, SURE_AGREEMENT, KeyframeOdometry, Placement, View
@@ -30,6 +30,12 @@ class RgbdTracker(Tracker):
     """Frame-to-keyframe alignment, loop closing, relocalisation; needs no poses."""
 
     uses_given_poses = False
+
+    @classmethod
+    def make(
+        cls, settings: TrackingSettings, preprocess: PreprocessSettings, source: PoseSource
+    ) -> RgbdTracker:
+        return cls(settings, preprocess)
 
     def __init__(
         self,

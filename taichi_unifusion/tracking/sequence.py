@@ -15,7 +15,7 @@ from ..datasets.loading import index_in_recording, load_ahead
 from ..errors import FrameError, PoseError
 from ..files.atomic import atomic_write
 from ..types import Frame
-from .base import TrackedFrame, Tracker, TrackingResult, Verdict
+from .base import Tracker, TrackingResult, Verdict
 from .external import runs
 
 logger = logging.getLogger(__name__)
@@ -32,10 +32,11 @@ def track_sequence(
     on_frame: Callable[[int, int], None] = lambda done, total: None,
 ) -> TrackingResult:
     """Poses of all frames, final; frames that cannot be loaded or tracked are in it with their
-    reason, and said.
+    reason. What is odd is said, and in `details["warnings"]`.
     """
     started, interrupted = time.perf_counter(), False
     frames = sequence if tracker.uses_given_poses else sequence.without_poses()
+    warnings = _said([*_pose_warnings(frames), *tracker.warnings])
     for i, load in enumerate(load_ahead(frames)):
         if interrupted := stop():
             break
@@ -48,12 +49,29 @@ def track_sequence(
         on_frame(i + 1, len(sequence))
     result = tracker.finish()
     seconds = time.perf_counter() - started
-    details = {**result.details, "verdicts": result.counts, "seconds": round(seconds, 3)}
-    return replace(result, details={**details, "warnings": _warn(result)}, interrupted=interrupted)
+    details = {
+        **result.details,
+        "verdicts": result.counts,
+        "seconds": round(seconds, 3),
+        "warnings": warnings + _said(_not_tracked(result)),
+    }
+    return replace(result, details=details, interrupted=interrupted)
 
 
-def _warn(result: TrackingResult) -> list[str]:
-    """Say once for every reason which frames have no pose, and which kept one that was not refined."""
+def _said(sentences: list[str]) -> list[str]:
+    for sentence in sentences:
+        logger.warning("%s", sentence)
+    return sentences
+
+
+def _pose_warnings(frames: Dataset) -> list[str]:
+    """What a recording has to say of its own poses: the map, which gets others, will not say it."""
+    others = frames.without_poses().warnings
+    return [sentence for sentence in frames.warnings if sentence not in others]
+
+
+def _not_tracked(result: TrackingResult) -> list[str]:
+    """For every reason, which frames have no pose, and which kept one that was not refined."""
     sentences = []
     for verdict in (*NO_POSE, Verdict.PRIOR_KEPT):
         members = [frame for frame in result.frames if frame.verdict is verdict]
@@ -69,8 +87,6 @@ def _warn(result: TrackingResult) -> list[str]:
             f"tracking: {len(members)} of {len(result.frames)} frames {what}: {_shortened(where)} "
             f"(first: {members[0].message})"
         )
-    for sentence in sentences:
-        logger.warning("%s", sentence)
     return sentences
 
 
@@ -79,17 +95,17 @@ def _shortened(where: list[str], most: int = 8) -> str:
 
 
 class PosedFrames(DatasetView):
-    """The frames of a sequence with the poses that a tracker found; one without a pose raises
-    PoseError that says why.
+    """The frames of a sequence with the poses of `tracking`; a frame without one raises PoseError
+    that says why.
     """
 
     def __init__(self, sequence: Dataset, tracking: TrackingResult) -> None:
         frames = sequence.without_poses()
         super().__init__(frames, range(len(tracking.frames)))
-        self.tracked: tuple[TrackedFrame, ...] = tracking.frames
+        self.tracking = tracking
 
     def load(self, index: int) -> Frame:
-        frame, tracked = super().load(index), self.tracked[index]
+        frame, tracked = super().load(index), self.tracking.frames[index]
         if tracked.T_world_camera is None:
             raise PoseError(f"{frame.label}: {tracked.verdict}, {tracked.message}")
         return replace(frame, T_world_camera=tracked.T_world_camera)

@@ -39,7 +39,7 @@ def read_poses(path: str | Path) -> ExternalPoses:
     """Read a trajectory; the number of columns tells its format.
 
     Raises DatasetError, with the line, where it holds no poses; a single pose that is not rigid is
-    left out and said.
+    left out, which a warning says.
     """
     path = Path(path).expanduser()
     if path.is_dir():
@@ -80,5 +80,9 @@ def _checked(path: Path, by_time: bool, poses: Sequence[tuple[float, Pose]]) -> 
         matrices.append(T_world_camera)
     if not keys:
         raise DatasetError(f"{path}: holds no usable pose (first: {problems[0]})")
-    warnings = [f"{len(problems)} poses left out (first: {problems[0]})"] if problems else []
-    return ExternalPoses(str(path), by_time, np.array(keys), np.array(matrices), tuple(warnings))
+    warnings = ()
+    if problems:
+        warnings = (
+            f"{path}: {len(problems)} of {len(poses)} poses left out (first: {problems[0]})",
+        )
+    return ExternalPoses(str(path), by_time, np.array(keys), np.array(matrices), warnings)

@@ -80,6 +80,22 @@ def test_external_poses_and_a_gap(tmp_path, capsys):
     assert metrics["frames"]["used"] == 3 and rows[1]["verdict"] == "interpolated"
 
 
+def test_a_broken_pose_of_a_trajectory_is_said(tmp_path, capsys):
+    path, room = tmp_path / "slam.txt", SyntheticRoom()
+    write_trajectory(path, Trajectory(np.arange(3) / 30, room.T_world_camera[:3]))
+    lines = path.read_text().splitlines()
+    broken = len(lines) - 2
+    lines[broken] = " ".join([*lines[broken].split()[:-1], "1.32"])
+    path.write_text("\n".join(lines))
+    arguments = ["--tracking", "external", "--trajectory", str(path), "--interpolate"]
+    assert cli.main([*FEW, *arguments, "--out", str(tmp_path / "out")]) == 0
+    sentence = f"{path}: 1 of 3 poses left out (first: {path}, line {broken + 1}: "
+    assert sentence in capsys.readouterr().err
+    metrics, rows, _ = written(tmp_path / "out")
+    assert metrics["tracking"]["warnings"][0].startswith(sentence)
+    assert [row["verdict"] for row in rows] == ["given", "interpolated", "given"]
+
+
 def test_every_thins_the_map_and_not_the_tracking(tmp_path):
     assert cli.main([*FEW, "--every", "2", "--tracking", "rgbd", "--out", str(tmp_path)]) == 0
     metrics, rows, mapped = written(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,7 +13,15 @@ from taichi_unifusion.errors import DatasetError, InputError
 from taichi_unifusion.files.trajectories import write_trajectory
 from taichi_unifusion.geometry import se3
 from taichi_unifusion.geometry.quaternions import rotation_to_quaternion
-from taichi_unifusion.tracking import TrackedFrame, Verdict, make_tracker
+from taichi_unifusion.tracking import (
+    TRACKERS,
+    Mode,
+    TrackedFrame,
+    Verdict,
+    check_poses,
+    make_tracker,
+    track,
+)
 from taichi_unifusion.tracking.external import gaps, interpolate
 from taichi_unifusion.tracking.rgbd import RgbdTracker
 from taichi_unifusion.tracking.sequence import track_sequence
@@ -150,7 +159,10 @@ def test_interpolation_is_constant_motion():
         ("x 0 0 0 0 0 0 1\n", "'x' is not a time stamp"),
         ("0 0 0 0 0 0 0 2\n", "quaternion's length is 2"),
         ("0 0 0 nan 0 0 0 1\n", "no usable pose"),
-        (" ".join(["1"] * 12) + "\n1 0\n", "line 2: expected 12 columns (the first 3 rows of a 4x4 matrix), found 2"),
+        (
+            " ".join(["1"] * 12) + "\n1 0\n",
+            "line 2: expected 12 columns (the first 3 rows of a 4x4 matrix), found 2",
+        ),
         (" ".join(["1"] * 16), "no usable pose"),
     ],
 )
@@ -160,6 +172,51 @@ def test_P7_bad_trajectories_are_one_clear_error(content, told, tmp_path):
     with pytest.raises(DatasetError, match="poses.txt") as caught:
         read_poses(path)
     assert told in str(caught.value)
+
+
+@pytest.mark.parametrize("mode", ["external", "internal"])
+def test_a_broken_pose_is_left_out_and_said(mode, walk, tmp_path, caplog):
+    """Said when tracking starts and in the result, whoever reads the file."""
+    path = tmp_path / "poses.txt"
+    lines = [tum_line(frame.timestamp, frame.T_world_camera) for frame in walk[:3]]
+    lines[1] = " ".join([*lines[1].split()[:-1], "1.32"])
+    path.write_text("\n".join(lines))
+    posed = track(Listed(walk[:3]), mode=mode, trajectory=path, interpolate=True)
+    sentence = posed.tracking.details["warnings"][0]
+    assert sentence.startswith(f"{path}: 1 of 3 poses left out (first: {path}, line 2: ")
+    assert [record.message for record in caplog.records].count(sentence) == 1
+
+
+def test_warnings_about_given_poses_outlive_them(walk, caplog):
+    """The map gets other poses and cannot say what was odd about these."""
+
+    class Odd(Listed):
+        warnings = ("depth looks odd", "poses look odd")
+
+        def without_poses(self):
+            bare_ones = Listed([bare(frame) for frame in self.items])
+            bare_ones.warnings = self.warnings[:1]
+            return bare_ones
+
+    posed = track(Odd(walk[:2]), mode="given")
+    assert posed.tracking.details["warnings"] == ["poses look odd"]
+    assert caplog.text.count("poses look odd") == 1
+    assert posed.warnings == ("depth looks odd",)  # left for the map's run to say
+    assert track(Odd(walk[:2]), mode="rgbd").tracking.details["warnings"] == []
+
+
+def test_modes_are_the_trackers():
+    assert get_args(Mode) == tuple(TRACKERS)
+
+
+def test_modes_that_need_poses_refuse_a_recording_without(walk, tmp_path):
+    frames = Listed([bare(frame) for frame in walk[:1]])
+    frames.no_poses = "nowhere: no poses.txt"
+    for mode in ("given", "internal"):
+        with pytest.raises(DatasetError, match="no poses.txt, so the frames have no poses"):
+            track(frames, mode=mode)
+    for mode, trajectory in (("rgbd", None), ("external", tmp_path), ("internal", tmp_path)):
+        check_poses(frames, mode, trajectory)
 
 
 def test_a_trajectory_of_another_recording_is_an_error_with_both_ranges(walk, tmp_path):
