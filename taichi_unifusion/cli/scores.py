@@ -41,10 +41,9 @@ class ScoreOptions:
         """
         text = json.dumps(_plain({**about, **dataclasses.asdict(result)}), indent=2)
         if self.out:
-            from ..files.atomic import atomic_write
+            from ..files.atomic import write_text
 
-            with atomic_write(self.out) as temporary:
-                temporary.write_text(text + "\n", encoding="utf-8")
+            write_text(self.out, text + "\n")
         print(text if self.json else "\n\n".join(blocks))
         return DONE
 

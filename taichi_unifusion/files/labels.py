@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError, FileError, InputError
+from .arrays import read_array
 from .atomic import read_bytes
 from .mesh_reading import read_mesh
 from .text_rows import parse_lines
@@ -49,20 +49,10 @@ def read_labels(path: str | Path, attribute: str = "label") -> LabelFile:
     if suffix == ".txt":
         return LabelFile(_parse_text(path))
     if suffix == ".npy":
-        try:
-            values = np.load(io.BytesIO(read_bytes(path)), allow_pickle=False)
-        except (ValueError, EOFError, OSError) as error:
-            if isinstance(error, FileError):
-                raise
-            raise FileError(f"{path}: not an array that NumPy wrote, or a damaged file") from None
-        if (
-            not isinstance(values, np.ndarray)
-            or values.dtype.kind not in "iufb"
-            or values.squeeze().ndim != 1
-        ):
+        values = read_array(path)
+        if values.dtype.kind not in "iufb" or values.squeeze().ndim != 1:
             raise InputError(
-                f"{path}: expected one number a point, got {getattr(values, 'shape', 'an archive')} "
-                f"{getattr(values, 'dtype', '')}".rstrip()
+                f"{path}: expected one number a point, got {values.shape} {values.dtype}"
             )
         return LabelFile(values.squeeze().astype(np.float64))
     raise InputError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import re
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, did_you_mean
+from ..files.arrays import read_archive, read_array
 from ..files.atomic import read_bytes
 from ..networks.encoders import unit_length
 
@@ -67,8 +67,8 @@ def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> Tex
     """
     path = Path(file)
     if path.suffix == ".npz":
-        arrays = _load(path)
-        if not {"names", "vectors"} <= set(getattr(arrays, "files", ())):
+        arrays = read_archive(path)
+        if not {"names", "vectors"} <= set(arrays.files):
             raise InputError(f"{path}: must hold arrays 'names' and 'vectors'")
         try:
             listed, vectors = [str(name) for name in arrays["names"]], arrays["vectors"]
@@ -78,7 +78,7 @@ def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> Tex
                 "text"
             ) from None
     else:
-        vectors = _load(path)
+        vectors = read_array(path)
         beside = [path.with_suffix(suffix) for suffix in (".txt", ".json", ".csv")]
         found = Path(names) if names else next((other for other in beside if other.exists()), None)
         if found is None:
@@ -98,17 +98,6 @@ def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> Tex
         bad = listed[int(np.argmin(np.isfinite(vectors).all(axis=1)))]
         raise InputError(f"{path}: the vector of '{bad}' is zero or not finite")
     return TextEmbeddings(str(path), tuple(listed), vectors)
-
-
-def _load(path: Path):
-    try:
-        return np.load(io.BytesIO(read_bytes(path)), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(
-            f"{path}: not arrays that NumPy wrote, or a damaged file ({str(error)[:120]})"
-        ) from None
 
 
 def _read_names(path: Path) -> list[str]:

@@ -4,17 +4,15 @@ way.
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
+from ..errors import FileError, FrameError, InputError, check_choice
+from ..files.arrays import open_planes
 from ..files.frame_files import FrameFolder, files_by_stem
 from ..networks.encoders import unit_length
 from ..types import Frame
@@ -68,7 +66,7 @@ def read_features(path: Path, layout: str = "auto") -> NDArray[np.float32]:
     Raises FileError where the file is missing, damaged or would run code, InputError where it holds
     something else.
     """
-    with _planes(path) as (shape, planes):
+    with open_planes(path) as (shape, planes):
         if len(shape) == 4 and shape[0] == 1:
             raise InputError(f"{path}: has a batch axis, shape {shape}; save the one image alone")
         if len(shape) != 3 or not all(0 < n <= MAX_SIDE for n in shape):
@@ -105,85 +103,3 @@ def _block_mean(values: NDArray, count: int) -> NDArray[np.float32]:
     sums = np.add.reduceat(values.astype(np.float32), starts, axis=0)
     lengths = np.diff([*starts, len(values)]).astype(np.float32)
     return sums / lengths.reshape(-1, *[1] * (values.ndim - 1))
-
-
-@contextmanager
-def _planes(path: Path) -> Iterator[tuple[tuple[int, ...], Iterator[NDArray]]]:
-    """Shape of the one array in a file, and its slices along the first axis, read one after the
-    other.
-    """
-    try:
-        if path.suffix == ".pt":
-            array = _open_torch(path)
-            yield tuple(array.shape), (array[i].float().numpy() for i in range(array.shape[0]))
-        elif path.suffix == ".npz":
-            with zipfile.ZipFile(path) as archive:
-                members = [name for name in archive.namelist() if name.endswith(".npy")]
-                if len(members) != 1:
-                    raise InputError(f"{path}: holds {len(members)} arrays, expected one")
-                with archive.open(members[0]) as file:
-                    yield _stream(path, file)
-        else:
-            with open(path, "rb") as file:
-                yield _stream(path, file)
-    except FileNotFoundError:
-        raise FileError(f"{path}: no such file") from None
-    except (zipfile.BadZipFile, OSError, EOFError) as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(f"{path}: a damaged file ({str(error)[:120]})") from None
-
-
-def _stream(path: Path, file: BinaryIO) -> tuple[tuple[int, ...], Iterator[NDArray]]:
-    """Header and slices of an array in NumPy's format."""
-    try:
-        version = np.lib.format.read_magic(file)
-        read = (
-            np.lib.format.read_array_header_1_0
-            if version == (1, 0)
-            else np.lib.format.read_array_header_2_0
-        )
-        shape, fortran, dtype = read(file)
-    except ValueError as error:
-        raise FileError(f"{path}: not an array that NumPy wrote ({str(error)[:120]})") from None
-    if dtype.kind != "f" or fortran:
-        raise InputError(
-            f"{path}: features must be floating-point numbers in C order, got {dtype}"
-            f"{' in Fortran order' * fortran}; a pickle is never read"
-        )
-    return shape, _slices(path, file, shape, dtype)
-
-
-def _slices(
-    path: Path, file: BinaryIO, shape: tuple[int, ...], dtype: np.dtype
-) -> Iterator[NDArray]:
-    size = int(np.prod(shape[1:])) * dtype.itemsize
-    for _ in range(shape[0]):
-        data = file.read(size)
-        if len(data) < size:
-            raise FileError(f"{path}: the file ends early; it was cut off")
-        yield np.frombuffer(data, dtype).reshape(shape[1:])
-
-
-def _open_torch(path: Path):
-    try:
-        import torch
-    except ImportError:
-        raise MissingDependency(
-            f"{path}: .pt files are read by torch: pip install 'taichi-unifusion[clip]', or save "
-            ".npy"
-        ) from None
-    if not path.exists():
-        raise FileNotFoundError
-    try:
-        array = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # noqa: BLE001 - torch has a class of its own for every kind
-        line = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
-        raise FileError(
-            f"{path}: not a tensor that torch reads safely, without running code ({line})"
-        ) from None
-    if not isinstance(array, torch.Tensor) or not array.is_floating_point():
-        raise InputError(
-            f"{path}: holds {type(array).__name__}, expected one tensor of floating-point numbers"
-        )
-    return array.squeeze(0) if array.ndim == 4 and array.shape[0] == 1 else array

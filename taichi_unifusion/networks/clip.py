@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
+from ..files.atomic import read_bytes
 from ..types import Frame
 from .encoders import unit_length
 from .image_input import normalized, resized, whole_patches
@@ -258,7 +259,7 @@ def _normalization(name: str, kind: str) -> tuple[Sequence[float], Sequence[floa
     file = Path(name) / "preprocessor_config.json"
     if file.is_file():
         try:
-            values = json.loads(file.read_text(encoding="utf-8"))
+            values = json.loads(read_bytes(file))
             if "image_mean" in values and "image_std" in values:
                 return values["image_mean"], values["image_std"]
         except ValueError as error:

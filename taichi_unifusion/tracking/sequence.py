@@ -13,7 +13,7 @@ from pathlib import Path
 from ..datasets import Dataset, DatasetView
 from ..datasets.loading import index_in_recording, load_ahead
 from ..errors import FrameError, PoseError
-from ..files.atomic import atomic_write
+from ..files.atomic import write_text
 from ..types import Frame
 from .base import Tracker, TrackingResult, Verdict
 from .external import runs
@@ -128,8 +128,7 @@ def write_tracking(path: Path, result: TrackingResult) -> None:
                 frame.message,
             ]
         )
-    with atomic_write(path) as temporary:
-        temporary.write_text(text.getvalue(), encoding="utf-8")
+    write_text(path, text.getvalue())
 
 
 def _number(value: float | None, form: str) -> str:
