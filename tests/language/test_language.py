@@ -126,7 +126,7 @@ def test_wrong_embeddings_are_said(tmp_path):
         ("other.npz", "names"),
         ("objects.npz", "can run code"),
         ("alone.npy", "--names"),
-        ("text.npz", "not arrays"),
+        ("text.npz", "not an array"),
         ("absent.npz", "no such file"),
     ):
         with pytest.raises((InputError, FileError), match=message):
