@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from places import DATA
 
-from taichi_unifusion import runtime
 from taichi_unifusion.errors import InputError, PoseError
+from taichi_unifusion.rendering.depth_buffer import draw_depth_buffer
 from taichi_unifusion.rendering.preview import Viewpoint, render_mesh, render_preview
 from taichi_unifusion.types import Mesh, PinholeCamera, Trajectory
 
@@ -116,72 +116,15 @@ def is_like(pixel, color) -> bool:
     )
 
 
-def rasterize(vertices, faces, T_world_camera, near):
-    """Depth (H, W), 0 where nothing is seen, and triangle (H, W) of the kernel."""
-    from taichi_unifusion.rendering.kernels.raster import EMPTY
-    from taichi_unifusion.rendering.kernels.raster import rasterize as kernel
-
-    runtime.current()
-    nearest = np.zeros((CAMERA.height, CAMERA.width), np.int64)
-    kernel(
-        vertices,
-        faces,
-        0,
-        np.ascontiguousarray(CAMERA.matrix @ np.linalg.inv(T_world_camera)[:3]),
-        near,
-        nearest,
+def depth_of(mesh: Mesh, T_world_camera) -> np.ndarray:
+    """Depth (H, W) of the sides that face the camera, 0 where nothing is seen."""
+    buffer = draw_depth_buffer(
+        mesh.vertices, mesh.faces, CAMERA, T_world_camera, 0.1, two_sided=False
     )
-    depth = (nearest >> 32).astype(np.int32).view(np.float32)
-    return np.where(nearest == EMPTY, 0, depth), np.where(
-        nearest == EMPTY, -1, nearest & 0xFFFFFFFF
-    )
-
-
-def ray_cast(vertices, faces, T_world_camera, near):
-    """What `rasterize` must give, by intersecting every ray with every triangle in float64; and
-    pixels near some edge.
-    """
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    rays = np.stack(
-        [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1
-    ).reshape(-1, 3)
-    local = (vertices.astype(float) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-    depth, unsure = np.full(len(rays), np.inf), np.zeros(len(rays), bool)
-    for a, b, c in local[faces]:
-        n = np.cross(b - a, c - a)
-        z = (n @ a) / (rays @ n)
-        p = rays * z[:, None]
-        weights = np.stack(
-            [np.cross(q - p, r - p) @ n for q, r in ((b, c), (c, a), (a, b))], axis=1
-        ) / (n @ n)
-        hit = (rays @ n < 0) & (z >= near) & (weights.min(axis=1) >= 0)
-        unsure |= (rays @ n < 0) & (z > 0) & (np.abs(weights).min(axis=1) < EDGE_BAND) | (
-            np.abs(z - near) < EDGE_BAND
-        )
-        depth = np.where(hit & (z < depth), z, depth)
-    return np.where(np.isinf(depth), 0, depth).reshape(u.shape), unsure.reshape(u.shape)
+    return buffer.depth(0.0)
 
 
 # The kernel
-
-
-@pytest.mark.parametrize(
-    ("count", "spread"),
-    [(1000, 0.3), (100, 4.0)],
-    ids=["small", "across the near plane and the border"],
-)
-def test_rasterize_equals_ray_casting(count, spread):
-    rng = np.random.default_rng(3)
-    centers = rng.uniform((-3, -3, -2), (3, 3, 6), (count, 1, 3))
-    vertices = (
-        (centers + rng.normal(scale=spread, size=(count, 3, 3))).reshape(-1, 3).astype(np.float32)
-    )
-    faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
-    T_world_camera = looking((0.2, -0.1, 0.3), (0.1, 0.4, 5), up=(0, -1, 0))
-    depth, _ = rasterize(vertices, faces, T_world_camera, 0.4)
-    expected, unsure = ray_cast(vertices, faces, T_world_camera, 0.4)
-    assert unsure.mean() < 0.05 and (expected > 0).mean() > 0.2
-    np.testing.assert_allclose(depth[~unsure], expected[~unsure], rtol=DEPTH_TOLERANCE)
 
 
 def test_rasterize_leaves_no_gap_along_shared_edges():
@@ -189,7 +132,7 @@ def test_rasterize_leaves_no_gap_along_shared_edges():
     wall = quad([(-0.5, -0.5, 1), (-0.5, 0.5, 1), (0.5, 0.5, 1), (0.5, -0.5, 1)], RED, steps=20)
     T = np.eye(4)
     T[:2, 3] = 0.0125, 0.0125  # half a pixel at depth 1
-    depth, _ = rasterize(wall.vertices, wall.faces, T, 0.1)
+    depth = depth_of(wall, T)
     inside = depth[5:42, 13:50]
     assert (inside > 0).all() and (depth == 0).any()
 
@@ -197,8 +140,9 @@ def test_rasterize_leaves_no_gap_along_shared_edges():
 def test_rasterize_does_not_depend_on_order():
     mesh = room(6)
     T = looking((0.3, 0.2, 1.0), (2, 1, 0.5))
-    depth, _ = rasterize(mesh.vertices, mesh.faces, T, 0.1)
-    shuffled, _ = rasterize(mesh.vertices, np.random.default_rng(0).permutation(mesh.faces), T, 0.1)
+    depth = depth_of(mesh, T)
+    other = Mesh(mesh.vertices, np.random.default_rng(0).permutation(mesh.faces))
+    shuffled = depth_of(other, T)
     assert np.array_equal(depth, shuffled) and (depth > 0).all()
 
 

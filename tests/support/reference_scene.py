@@ -1,8 +1,9 @@
-"""Slow twins of kernels/texturing.py: every ray against every triangle, in float64 NumPy."""
+"""Slow twins of rendering/kernels/texturing.py: every ray against every triangle, in float64 NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
+from reference_raster import barycentric, in_camera, rasterize
 
 from taichi_unifusion.rendering.kernels.texturing import MAX_TAPS, SAMPLES, SHADE, SLACK
 from taichi_unifusion.rendering.textured_scene import BACKGROUND, LIGHT, TexturedScene, mip_levels
@@ -11,51 +12,11 @@ from taichi_unifusion.types import PinholeCamera
 STEP = 1e-4  # [px] of the finite differences
 
 
-def rays_of(camera: PinholeCamera, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Directions (..., 3) of unit depth through image points."""
-    return np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(np.shape(u))], axis=-1
-    )
-
-
-def barycentric(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (N,) and barycentric coordinates (N, 3) at which rays (N, 3) meet the plane of a
-    triangle (3, 3), camera frame.
-    """
-    a, b, c = corners
-    n = np.cross(b - a, c - a)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = (n @ a) / (rays @ n)
-    p = rays * z[:, None]
-    return z, np.stack(
-        [np.cross(q - p, r - p) @ n for q, r in ((b, c), (c, a), (a, b))], axis=1
-    ) / (n @ n)
-
-
 def cast(scene: TexturedScene, camera: PinholeCamera, T_world_camera: np.ndarray):
     """Depth (0: no hit), triangle (-1) and how near to an edge of any triangle, each (H, W), at the
     pixels' centres.
     """
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = rays_of(camera, u, v).reshape(-1, 3)
-    local = in_camera(scene, T_world_camera)
-    depth, face, margin = (
-        np.full(len(rays), np.inf),
-        np.full(len(rays), -1),
-        np.full(len(rays), np.inf),
-    )
-    for f, corners in enumerate(local[scene.faces]):
-        z, w = barycentric(corners, rays)
-        ahead = np.isfinite(z) & (z > 0)
-        margin = np.where(ahead, np.minimum(margin, np.abs(w).min(axis=1)), margin)
-        nearer = ahead & (w.min(axis=1) >= 0) & (z < depth)
-        depth, face = np.where(nearer, z, depth), np.where(nearer, f, face)
-    return tuple(x.reshape(u.shape) for x in (np.where(face < 0, 0, depth), face, margin))
-
-
-def in_camera(scene: TexturedScene, T_world_camera: np.ndarray) -> np.ndarray:
-    """Vertices (V, 3) in the camera frame."""
-    return (scene.vertices.astype(float) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    return rasterize(scene.vertices, scene.faces, True, camera, T_world_camera, 0.0)[:3]
 
 
 def read_surfaces(scene: TexturedScene, camera: PinholeCamera, T_world_camera: np.ndarray):
@@ -63,9 +24,8 @@ def read_surfaces(scene: TexturedScene, camera: PinholeCamera, T_world_camera: n
     (H, W).
     """
     depth, face, margin = cast(scene, camera, T_world_camera)
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = rays_of(camera, u, v)
-    corners = in_camera(scene, T_world_camera)[scene.faces]
+    rays = camera.rays()
+    corners = in_camera(scene.vertices, T_world_camera)[scene.faces]
     n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[face]
     cosine = (
         np.abs((n * rays).sum(axis=-1)) / np.linalg.norm(n, axis=-1) / np.linalg.norm(rays, axis=-1)
@@ -86,7 +46,7 @@ def shade_textured(scene: TexturedScene, camera: PinholeCamera, T_world_camera: 
     _, face, margin = cast(scene, finer, T_world_camera)
     sure = blocks(margin > 1e-4).all(axis=-1)
     pyramids = [[level / 255.0 for level in mip_levels(texture)] for texture in scene.textures]
-    local = in_camera(scene, T_world_camera)
+    local = in_camera(scene.vertices, T_world_camera)
     image = np.zeros((camera.height, camera.width, 3))
     seen = blocks(face)  # (H, W, SAMPLES^2)
     for y, x in np.ndindex(image.shape[:2]):
@@ -115,9 +75,7 @@ def shade_triangle(scene, pyramids, camera, local, T_world_camera, f, u, v):
     corners = local[scene.faces[f]]
 
     def weights_at(u, v):
-        return np.clip(
-            barycentric(corners, rays_of(camera, np.array([u]), np.array([v])))[1][0], 0, None
-        )
+        return np.clip(barycentric(corners, camera.rays([u], [v]))[1][0], 0, None)
 
     w = weights_at(u, v)
     w /= w.sum()
@@ -126,7 +84,7 @@ def shade_triangle(scene, pyramids, camera, local, T_world_camera, f, u, v):
         uv = scene.corners[f].reshape(3, 2).astype(float)
 
         def uv_at(u, v):
-            return barycentric(corners, rays_of(camera, np.array([u]), np.array([v])))[1][0] @ uv
+            return barycentric(corners, camera.rays([u], [v]))[1][0] @ uv
 
         along_u = SAMPLES * (uv_at(u + STEP, v) - uv_at(u - STEP, v)) / (2 * STEP)
         along_v = SAMPLES * (uv_at(u, v + STEP) - uv_at(u, v - STEP)) / (2 * STEP)
