@@ -184,12 +184,10 @@ class Scene:
         sees.
         """
         color, cosine = np.zeros((*depth.shape, 3), np.uint8), np.zeros_like(depth)
-        low, high = self.corners[0, 0], self.corners[0, -1]  # of the room
         shade_surfaces(
             _intrinsics(camera),
-            ti.Matrix(T_world_camera),
-            ti.Vector(low),
-            ti.Vector(high),
+            ti.Matrix(T_world_camera[:3]),
+            ti.Matrix(self.corners[0, [0, -1]]),
             depth,
             hit,
             self.shapes,

@@ -123,7 +123,7 @@ class TexturedScene:
             self._on_device.vertices,
             self._on_device.faces,
             self._on_device.face_object,
-            ti.Matrix(T_world_camera),
+            ti.Matrix(T_world_camera[:3]),
             ti.math.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
             nearest,
             depth,

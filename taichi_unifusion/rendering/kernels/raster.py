@@ -14,17 +14,18 @@ EMPTY = (1 << 63) - 1  # depth buffer value where no triangle is seen
 EDGE = 1e-7  # barycentric slack: pixels on a shared edge belong to both triangles, never to none
 GOLDEN_ANGLE = 2.3999632
 
-# The look: half Lambert under one light and ambient occlusion, both kept mild so that colours stay
-# true
-LIFT = 1.15  # brings a surface that half faces the light back to its own colour
+# Half Lambert under one light, and ambient occlusion: both mild, so that colours stay true
+LIFT = 1.15  # factor that gives a surface at 60 degrees to the light about its own colour
 OCCLUSION_GAIN = 2.0
 OCCLUSION_BIAS = 0.15  # sine of the slope that noise on flat surfaces may have
-OCCLUSION_SHARE = 0.5  # how dark the deepest corner gets
+OCCLUSION_SHARE = 0.5  # of its brightness that the deepest corner loses
 
 # (3, 4) world [m] -> homogeneous image (u w, v w, w), w is depth [m]
 Projection = ti.types.ndarray(dtype=ti.f64, ndim=2)
 # (H, W) bits of the depth << 32 | triangle, or EMPTY
 DepthBuffer = ti.types.ndarray(dtype=ti.i64, ndim=2)
+Pose = ti.types.matrix(3, 4, ti.f32)  # rotation and translation, by value
+Image = ti.types.ndarray(dtype=ti.u8, ndim=3)  # (H, W, 3) RGB
 
 
 @ti.func
@@ -85,8 +86,8 @@ def rasterize(
     vertices: Floats2,  # (V, 3) world [m]
     faces: Ints2,  # (F, 3), counter-clockwise seen from the side that is drawn
     two_sided: ti.i32,  # 1: both sides are drawn
-    projection: Projection,
-    near: ti.f64,  # [m]
+    projection: Projection,  # (3, 4)
+    near: ti.f64,  # [m] nothing nearer is drawn
     # out:
     nearest: DepthBuffer,  # (H, W)
 ):
@@ -142,7 +143,7 @@ def occlusion(
         (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
     )
     reach = ti.min(radius * intrinsics[0] / z, 0.25 * nearest.shape[1])  # [px]
-    # spreads the error evenly
+    # a start angle for each pixel, so that few taps give noise rather than bands
     turn = 6.2831853 * ti.math.fract(52.9829189 * ti.math.fract(0.06711056 * u + 0.00583715 * v))
     hidden = 0.0
     for k in range(taps):
@@ -167,20 +168,20 @@ def occlusion(
 @ti.kernel
 def shade_pixels(
     # in:
-    vertices: Floats2,
-    normals: Floats2,
-    colors: Floats2,  # (V, 3) world [m], unit, RGB in [0, 1]
+    vertices: Floats2,  # (V, 3) world [m]
+    normals: Floats2,  # (V, 3) unit, world
+    colors: Floats2,  # (V, 3) RGB in [0, 1]
     faces: Ints2,  # (F, 3)
-    projection: Projection,
+    projection: Projection,  # (3, 4)
     R_camera_world: ti.math.mat3,
     intrinsics: ti.math.vec4,  # fx, fy, cx, cy of the depth buffer [px]
     nearest: DepthBuffer,  # (s H, s W)
-    light: ti.math.vec4,  # direction to the light in the camera frame; how much shading changes colours, 0..1
+    light: ti.math.vec4,  # unit direction to it, camera frame; how much it changes colours, 0..1
     radius: ti.f32,  # of ambient occlusion [m]
-    taps: ti.i32,  # depth samples for it
+    taps: ti.i32,  # depths looked at for it, a sample
     background: ti.math.vec3,  # RGB in [0, 1]
     # out:
-    image: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (H, W, 3) RGB
+    image: Image,  # (H, W, 3) RGB
 ):
     """Colour of every pixel: the mean over its s x s samples of interpolated vertex colour under
     soft light.

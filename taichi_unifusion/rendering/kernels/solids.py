@@ -8,6 +8,8 @@ alone, never on the order of evaluation.
 
 import taichi as ti
 
+from ...kernels.voxels import Floats1, Floats2, Floats3, Ints1, Ints2
+
 ROOM, BOX, CYLINDER, SPHERE = range(4)
 
 TILE = 16  # pixels per side of a culling tile
@@ -68,7 +70,7 @@ def hit_parameter(shape: ti.i32, o: ti.math.vec3, d: ti.math.vec3) -> ti.f32:
     it does not.
     """
     span = ti.math.vec2(-FAR, FAR)
-    if shape == ROOM or shape == BOX:
+    if shape == ROOM or shape == BOX:  # noqa: SIM109 (Taichi compiles no `in`)
         span = overlap(overlap(slab(o[0], d[0]), slab(o[1], d[1])), slab(o[2], d[2]))
     else:
         flat = ti.math.vec3(1.0, 1.0, 1.0 if shape == SPHERE else 0.0)
@@ -105,18 +107,14 @@ def to_local(T_local_camera: ti.template(), j: ti.i32, x: ti.math.vec3):
 def cast_rays(
     # in:
     intrinsics: ti.math.vec4,  # fx, fy, cx, cy [px]
-    shapes: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,) ROOM, BOX, CYLINDER or SPHERE
-    T_local_camera: ti.types.ndarray(dtype=ti.f32, ndim=3),  # (P, 3, 4) camera [m] -> unit solid
-    nearest: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (P,) no point of it has a smaller depth [m]
-    tile_starts: ti.types.ndarray(
-        dtype=ti.i32, ndim=1
-    ),  # (tiles + 1,) rows of tile_members, tiles row by row
-    tile_members: ti.types.ndarray(
-        dtype=ti.i32, ndim=1
-    ),  # primitives that may show in a tile, nearest first
+    shapes: Ints1,  # (P,) ROOM, BOX, CYLINDER or SPHERE
+    T_local_camera: Floats3,  # (P, 3, 4) camera [m] -> unit solid
+    nearest: Floats1,  # (P,) smallest depth of any of its points [m]
+    tile_starts: Ints1,  # (tiles + 1,) first row of tile_members, tiles row by row
+    tile_members: Ints1,  # (M,) primitives that may show in a tile, nearest first
     # out:
-    depth: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W) [m], 0 where nothing is hit
-    hit: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (H, W) primitive, -1 where nothing is hit
+    depth: Floats2,  # (H, W) [m], 0 where nothing is hit
+    hit: Ints2,  # (H, W) primitive, -1 where nothing is hit
 ):
     """First surface along the ray of every pixel; t is depth, because rays have unit z."""
     tiles_x = (depth.shape[1] + TILE - 1) // TILE
@@ -154,16 +152,14 @@ def gaussians(key: ti.u32):
 @ti.kernel
 def kinect_depth(
     # in:
-    exact: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W) [m], 0 where nothing is hit
-    cosine: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (H, W) of the angle of incidence
+    exact: Floats2,  # (H, W) [m], 0 where nothing is hit
+    cosine: Floats2,  # (H, W) of the angle of incidence
     closest: ti.f32,  # smallest exact depth of a hit [m]: bounds the projector's shadow
     seed: ti.i32,
     frame: ti.i32,
-    fx: ti.f32,
+    fx: ti.f32,  # [px]
     # out:
-    depth: ti.types.ndarray(
-        dtype=ti.f32, ndim=2
-    ),  # (H, W) [m] in whole millimetres, 0 where no reading
+    depth: Floats2,  # (H, W) [m] in whole millimetres, 0 where no reading
 ):
     """What a Kinect v1 would read: lateral and axial noise, projector shadow, grazing drop-outs,
     disparity and mm steps.

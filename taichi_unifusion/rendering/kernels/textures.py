@@ -6,6 +6,8 @@ that see a point agree.
 
 import taichi as ti
 
+from ...kernels.voxels import Floats2, Floats3, Ints1, Ints2
+from .raster import Image, Pose
 from .solids import CYLINDER, ROOM, SPHERE, TAU, multiply, to_local, uniform
 
 PATTERNS = {
@@ -26,6 +28,8 @@ PATTERNS = {
     )
 }
 PLAIN, PLANKS, WALLPAPER, WEAVE, BANDS, LANDSCAPE, MOSAIC, RUG, PANELS, GLOBE = PATTERNS.values()
+
+Corners = ti.types.matrix(2, 3, ti.f32)
 
 # [m] lattice of the three octaves of grain; the finest makes detail of about 1 cm
 GRAIN_CELLS = (0.1, 0.033, 0.011)
@@ -234,30 +238,21 @@ def ground_light(ground: ti.template(), share: ti.math.vec3) -> ti.f32:
 @ti.kernel
 def shade_surfaces(
     # in:
-    intrinsics: ti.math.vec4,
-    T_world_camera: ti.math.mat4,
-    room_low: ti.math.vec3,
-    room_high: ti.math.vec3,  # inner corners of the room, world [m]
-    depth: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    hit: ti.types.ndarray(dtype=ti.i32, ndim=2),  # of cast_rays
-    shapes: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    T_local_camera: ti.types.ndarray(dtype=ti.f32, ndim=3),
-    half_extents: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (P, 3) [m]
-    materials: ti.types.ndarray(
-        dtype=ti.i32, ndim=2
-    ),  # (P, 4) row of looks for the faces across x, y, below, above
-    patterns: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,) number in PATTERNS
-    looks: ti.types.ndarray(
-        dtype=ti.f32, ndim=2
-    ),  # (M, 12) size [m], grain, stretch, three RGB colours
-    ground: ti.types.ndarray(
-        dtype=ti.f32, ndim=2
-    ),  # (X, Y) shadow on the floor, 1 where none, corner to corner
+    intrinsics: ti.math.vec4,  # fx, fy, cx, cy [px]
+    T_world_camera: Pose,  # (3, 4)
+    room: Corners,  # (2, 3) lowest and highest inner corner of the room, world [m]
+    depth: Floats2,  # (H, W) [m] of cast_rays
+    hit: Ints2,  # (H, W) of cast_rays
+    shapes: Ints1,  # (P,)
+    T_local_camera: Floats3,  # (P, 3, 4)
+    half_extents: Floats2,  # (P, 3) [m]
+    materials: Ints2,  # (P, 4) row of looks for the faces across x, y, below, above
+    patterns: Ints1,  # (M,) number in PATTERNS
+    looks: Floats2,  # (M, 12) size [m], grain, stretch, three RGB colours
+    ground: Floats2,  # (X, Y) shadow on the floor, 1 where none, corner to corner
     # out:
-    color: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (H, W, 3) RGB
-    cosine: ti.types.ndarray(
-        dtype=ti.f32, ndim=2
-    ),  # (H, W) between the normal and the direction to the camera
+    color: Image,  # (H, W, 3) RGB
+    cosine: Floats2,  # (H, W) between the normal and the direction to the camera
 ):
     """Colour of the surface that each pixel sees."""
     for v, u in depth:
@@ -281,9 +276,8 @@ def shade_surfaces(
                     n_camera[c] += T_local_camera[j, r, c] * n_local[r]
             n_camera = n_camera.normalized()
             cosine[v, u] = ti.abs(n_camera.dot(ray.normalized()))
-            n4 = T_world_camera @ ti.math.vec4(n_camera, 0.0)
-            x4 = T_world_camera @ ti.math.vec4(at, 1.0)
-            n, x = ti.math.vec3(n4[0], n4[1], n4[2]), ti.math.vec3(x4[0], x4[1], x4[2])
+            n = T_world_camera @ ti.math.vec4(n_camera, 0.0)
+            x = T_world_camera @ ti.math.vec4(at, 1.0)
 
             face = (
                 0 if n_local[0] != 0.0 else (1 if n_local[1] != 0.0 else (2 if p[2] < 0.0 else 3))
@@ -305,9 +299,10 @@ def shade_surfaces(
             rgb *= weights[2] * (
                 1.0 + looks[m, 1] * (0.5 * grain[0] + 0.8 * grain[1] + 0.7 * grain[2] - 1.0)
             )
-            light = daylight(x, n, room_low, room_high)
+            low, high = room[0, :], room[1, :]
+            light = daylight(x, n, low, high)
             if x[2] < GROUND and n[2] > 0.5:
-                light *= ground_light(ground, (x - room_low) / (room_high - room_low))
+                light *= ground_light(ground, (x - low) / (high - low))
             rgb *= light
         for c in ti.static(range(3)):
             color[v, u, c] = ti.cast(ti.math.clamp(rgb[c], 0.0, 1.0) * 255.0 + 0.5, ti.u8)

@@ -9,7 +9,7 @@ McCormack et al. 1999), so that colour aliases neither inside triangles nor at t
 import taichi as ti
 
 from ...kernels.voxels import Floats2, Ints1, Ints2, row3
-from .raster import EMPTY, DepthBuffer, Projection, depth_of, edge_functions, project
+from .raster import EMPTY, DepthBuffer, Image, Pose, Projection, depth_of, edge_functions, project
 
 MAX_TAPS = 8  # along the long axis of a footprint; longer ones are blurred
 SLACK = 0.05  # of a tap: a footprint that is square but for rounding takes one
@@ -116,7 +116,7 @@ def shade_triangle(
         t = face_texture[f]
         rgb *= sample_texture(texels, levels, textures[t, 0], textures[t, 1], st, along_u, along_v)
     n = (row3(vertices, b) - row3(vertices, a)).cross(row3(vertices, c) - row3(vertices, a))
-    # of the side that is seen
+    # towards the side that is seen
     n *= (1.0 if p0.dot(p1.cross(p2)) < 0.0 else -1.0) / (n.norm() + 1e-20)
     return rgb * (1.0 - SHADE * (0.5 - 0.5 * n.dot(light)))
 
@@ -124,20 +124,20 @@ def shade_triangle(
 @ti.kernel
 def shade_textured(
     # in:
-    vertices: Floats2,
-    colors: Floats2,  # (V, 3) world [m]; RGB in [0, 1], the factor of the texture
+    vertices: Floats2,  # (V, 3) world [m]
+    colors: Floats2,  # (V, 3) RGB in [0, 1], times the texture's
     faces: Ints2,  # (F, 3)
-    corners: Floats2,  # (F, 6) texture coordinates of a face's three corners, right and down, period 1
+    corners: Floats2,  # (F, 6) texture coordinates of the three corners, right and down, period 1
     face_texture: Ints1,  # (F,) row of textures, -1: none
     textures: Ints2,  # (T, 2) first row of levels, how many
     levels: Ints2,  # (L, 3) first row of texels, width, height
-    texels: Texels,
-    projection: Projection,
+    texels: Texels,  # (N, 3) RGB
+    projection: Projection,  # (3, 4)
     light: ti.math.vec3,  # unit, towards the light in the world
     background: ti.math.vec3,  # RGB in [0, 1]
     nearest: DepthBuffer,  # (SAMPLES H, SAMPLES W)
     # out:
-    color: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (H, W, 3) RGB
+    color: Image,  # (H, W, 3) RGB
 ):
     """Colour of every pixel under a constant soft light: the mean over its samples."""
     for y, x in ti.ndrange(color.shape[0], color.shape[1]):
@@ -186,7 +186,7 @@ def read_surfaces(
     vertices: Floats2,  # (V, 3) world [m]
     faces: Ints2,  # (F, 3)
     face_object: Ints1,  # (F,)
-    T_world_camera: ti.math.mat4,
+    T_world_camera: Pose,  # (3, 4)
     intrinsics: ti.math.vec4,  # fx, fy, cx, cy [px]
     nearest: DepthBuffer,  # (H, W)
     # out:
@@ -204,7 +204,7 @@ def read_surfaces(
             ray = ti.math.vec4(
                 (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0, 0.0
             )
-            along = (T_world_camera @ ray).xyz
+            along = T_world_camera @ ray
             depth[v, u] = depth_of(nearest[v, u])
             cosine[v, u] = ti.abs(n.dot(along)) / (n.norm() * along.norm() + 1e-20)
             object[v, u] = face_object[f]
