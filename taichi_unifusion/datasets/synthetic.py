@@ -14,7 +14,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from ..errors import InputError
@@ -166,7 +165,7 @@ class Scene:
         depth, hit = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
         nearest, starts, members = self._cull(camera, T_world_camera)
         cast_rays(
-            _intrinsics(camera),
+            camera.intrinsics,
             self.shapes,
             self._maps(T_world_camera),
             nearest,
@@ -185,9 +184,9 @@ class Scene:
         """
         color, cosine = np.zeros((*depth.shape, 3), np.uint8), np.zeros_like(depth)
         shade_surfaces(
-            _intrinsics(camera),
-            ti.Matrix(T_world_camera[:3]),
-            ti.Matrix(self.corners[0, [0, -1]]),
+            camera.intrinsics,
+            T_world_camera[:3],
+            self.corners[0, [0, -1]],  # of the room
             depth,
             hit,
             self.shapes,
@@ -262,7 +261,3 @@ class Scene:
             for c, s in zip(cover, (0.05, 0.16), strict=True)
         )
         return np.ascontiguousarray((1 - 0.45 * contact) * (1 - 0.4 * above), np.float32)
-
-
-def _intrinsics(camera: PinholeCamera):
-    return ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy])

@@ -156,11 +156,8 @@ def _drawable(mesh: Mesh) -> _Drawable:
 def _draw(drawable: _Drawable, view: Viewpoint) -> NDArray[np.uint8]:
     camera = view.camera.resized(view.camera.width * SAMPLES, view.camera.height * SAMPLES)
     drawn = _depth_buffer(drawable, camera, view.T_world_camera, view.near)
-    import taichi as ti
-
     from .kernels.raster import shade_pixels
 
-    T_camera_world = np.linalg.inv(view.T_world_camera)
     image = np.empty((view.camera.height, view.camera.width, 3), np.uint8)
     light = np.array(LIGHT) / np.linalg.norm(LIGHT)
     shade_pixels(
@@ -169,13 +166,13 @@ def _draw(drawable: _Drawable, view: Viewpoint) -> NDArray[np.uint8]:
         drawable.colors,
         drawable.faces,
         drawn.projection,
-        ti.math.mat3(T_camera_world[:3, :3].tolist()),
-        ti.math.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+        np.linalg.inv(view.T_world_camera)[:3],
+        camera.intrinsics,
         drawn.nearest,
-        ti.math.vec4(*light, drawable.shading),
+        (*light, drawable.shading),
         OCCLUSION_RADIUS,
         OCCLUSION_TAPS,
-        ti.math.vec3(BACKGROUND),
+        BACKGROUND,
         image,
     )
     return image

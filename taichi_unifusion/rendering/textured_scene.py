@@ -65,8 +65,6 @@ class TexturedScene:
         rigid transform.
         """
         on_device = self._on_device
-        import taichi as ti
-
         from .kernels.texturing import SAMPLES, shade_textured
 
         finer = camera.resized(camera.width * SAMPLES, camera.height * SAMPLES)
@@ -83,8 +81,8 @@ class TexturedScene:
             on_device.levels,
             on_device.texels,
             drawn.projection,
-            ti.math.vec3(light),
-            ti.math.vec3(BACKGROUND),
+            light,
+            BACKGROUND,
             drawn.nearest,
             color,
         )
@@ -113,7 +111,6 @@ class TexturedScene:
     def _surfaces(self, camera: PinholeCamera, T_world_camera: NDArray) -> dict[str, NDArray]:
         """Depth, cosine and object of every pixel."""
         nearest = self._depth_buffer(camera, T_world_camera).nearest
-        import taichi as ti
 
         from .kernels.texturing import read_surfaces
 
@@ -123,8 +120,8 @@ class TexturedScene:
             self._on_device.vertices,
             self._on_device.faces,
             self._on_device.face_object,
-            ti.Matrix(T_world_camera[:3]),
-            ti.math.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+            np.asarray(T_world_camera)[:3],
+            camera.intrinsics,
             nearest,
             depth,
             cosine,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import reference_raster as reference
 
-from taichi_unifusion import PinholeCamera, runtime
+from taichi_unifusion import PinholeCamera
 from taichi_unifusion.rendering.depth_buffer import draw_depth_buffer
 
 CAMERA = PinholeCamera(80, 60, 50, 52, 39.2, 30.1)
@@ -55,9 +55,6 @@ def test_rasterize_equals_its_twin(count, spread, two_sided):
 @pytest.mark.parametrize("radius", [1e-9, 0.4])
 def test_shade_pixels_equals_its_twin(radius):
     """Nothing occludes within a nanometre: there every pixel agrees."""
-    runtime.current()
-    import taichi as ti
-
     from taichi_unifusion.rendering.kernels.raster import shade_pixels
 
     samples, (vertices, faces) = 2, soup(150, 0.6, seed=1)
@@ -81,13 +78,13 @@ def test_shade_pixels_equals_its_twin(radius):
         colors,
         faces,
         buffer.projection,
-        ti.math.mat3(pose()[:3, :3].T.tolist()),
-        ti.math.vec4(finer.fx, finer.fy, finer.cx, finer.cy),
+        np.linalg.inv(pose())[:3],
+        finer.intrinsics,
         buffer.nearest,
-        ti.math.vec4(*light, look["shading"]),
+        (*light, look["shading"]),
         look["radius"],
         look["taps"],
-        ti.math.vec3(look["background"]),
+        look["background"],
         image,
     )
     expected = reference.shade_pixels(

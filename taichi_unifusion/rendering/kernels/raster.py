@@ -8,6 +8,7 @@ integer, so that the result does not depend on the order of threads.
 
 import taichi as ti
 
+from ...kernels.camera import Intrinsics, Pose, ray, rotate
 from ...kernels.voxels import Floats2, Ints2, row3
 
 EMPTY = (1 << 63) - 1  # depth buffer value where no triangle is seen
@@ -24,7 +25,6 @@ OCCLUSION_SHARE = 0.5  # of its brightness that the deepest corner loses
 Projection = ti.types.ndarray(dtype=ti.f64, ndim=2)
 # (H, W) bits of the depth << 32 | triangle, or EMPTY
 DepthBuffer = ti.types.ndarray(dtype=ti.i64, ndim=2)
-Pose = ti.types.matrix(3, 4, ti.f32)  # rotation and translation, by value
 Image = ti.types.ndarray(dtype=ti.u8, ndim=3)  # (H, W, 3) RGB
 
 
@@ -131,7 +131,7 @@ def occlusion(
     v: ti.i32,
     u: ti.i32,
     n: ti.math.vec3,
-    intrinsics: ti.math.vec4,
+    intrinsics: Intrinsics,
     radius: ti.f32,
     taps: ti.i32,
 ) -> ti.f32:
@@ -139,9 +139,7 @@ def occlusion(
     in the camera frame).
     """
     z = depth_of(nearest[v, u])
-    at = z * ti.math.vec3(
-        (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
-    )
+    at = z * ray(u, v, intrinsics)
     reach = ti.min(radius * intrinsics[0] / z, 0.25 * nearest.shape[1])  # [px]
     # a start angle for each pixel, so that few taps give noise rather than bands
     turn = 6.2831853 * ti.math.fract(52.9829189 * ti.math.fract(0.06711056 * u + 0.00583715 * v))
@@ -151,13 +149,7 @@ def occlusion(
         y = ti.math.clamp(ti.round(v + r * ti.sin(angle), ti.i32), 0, nearest.shape[0] - 1)
         x = ti.math.clamp(ti.round(u + r * ti.cos(angle), ti.i32), 0, nearest.shape[1] - 1)
         if nearest[y, x] != ti.i64(EMPTY):
-            d = (
-                depth_of(nearest[y, x])
-                * ti.math.vec3(
-                    (x - intrinsics[2]) / intrinsics[0], (y - intrinsics[3]) / intrinsics[1], 1.0
-                )
-                - at
-            )
+            d = depth_of(nearest[y, x]) * ray(x, y, intrinsics) - at
             length = d.norm() + 1e-6
             hidden += ti.max(0.0, n.dot(d) / length - OCCLUSION_BIAS) * ti.max(
                 0.0, 1.0 - length / radius
@@ -173,8 +165,8 @@ def shade_pixels(
     colors: Floats2,  # (V, 3) RGB in [0, 1]
     faces: Ints2,  # (F, 3)
     projection: Projection,  # (3, 4)
-    R_camera_world: ti.math.mat3,
-    intrinsics: ti.math.vec4,  # fx, fy, cx, cy of the depth buffer [px]
+    T_camera_world: Pose,  # (3, 4)
+    intrinsics: Intrinsics,  # of the depth buffer
     nearest: DepthBuffer,  # (s H, s W)
     light: ti.math.vec4,  # unit direction to it, camera frame; how much it changes colours, 0..1
     radius: ti.f32,  # of ambient occlusion [m]
@@ -205,9 +197,8 @@ def shade_pixels(
                 w = ti.max(w, 0.0) / ti.max(w, 0.0).sum()
                 w0, w1, w2 = ti.cast(w[0], ti.f32), ti.cast(w[1], ti.f32), ti.cast(w[2], ti.f32)
                 rgb = w0 * row3(colors, a) + w1 * row3(colors, b) + w2 * row3(colors, c)
-                n = R_camera_world @ (
-                    w0 * row3(normals, a) + w1 * row3(normals, b) + w2 * row3(normals, c)
-                )
+                n = w0 * row3(normals, a) + w1 * row3(normals, b) + w2 * row3(normals, c)
+                n = rotate(T_camera_world, n)
                 n /= n.norm() + 1e-9
                 lit = 0.5 + 0.5 * n.dot(light.xyz)  # half Lambert: nothing falls into black
                 hidden = occlusion(nearest, v, u, n, intrinsics, radius, taps)

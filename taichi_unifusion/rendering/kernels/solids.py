@@ -8,6 +8,7 @@ alone, never on the order of evaluation.
 
 import taichi as ti
 
+from ...kernels.camera import Intrinsics, ray
 from ...kernels.voxels import Floats1, Floats2, Floats3, Ints1, Ints2
 
 ROOM, BOX, CYLINDER, SPHERE = range(4)
@@ -106,7 +107,7 @@ def to_local(T_local_camera: ti.template(), j: ti.i32, x: ti.math.vec3):
 @ti.kernel
 def cast_rays(
     # in:
-    intrinsics: ti.math.vec4,  # fx, fy, cx, cy [px]
+    intrinsics: Intrinsics,
     shapes: Ints1,  # (P,) ROOM, BOX, CYLINDER or SPHERE
     T_local_camera: Floats3,  # (P, 3, 4) camera [m] -> unit solid
     nearest: Floats1,  # (P,) smallest depth of any of its points [m]
@@ -119,9 +120,7 @@ def cast_rays(
     """First surface along the ray of every pixel; t is depth, because rays have unit z."""
     tiles_x = (depth.shape[1] + TILE - 1) // TILE
     for v, u in depth:
-        ray = ti.math.vec3(
-            (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
-        )
+        direction = ray(u, v, intrinsics)
         best, winner = FAR, -1
         tile = v // TILE * tiles_x + u // TILE
         row, end = tile_starts[tile], tile_starts[tile + 1]
@@ -134,7 +133,7 @@ def cast_rays(
                 o = ti.math.vec3(
                     T_local_camera[j, 0, 3], T_local_camera[j, 1, 3], T_local_camera[j, 2, 3]
                 )
-                t = hit_parameter(shapes[j], o, to_local(T_local_camera, j, ray))
+                t = hit_parameter(shapes[j], o, to_local(T_local_camera, j, direction))
                 if t < best:
                     best, winner = t, j
         depth[v, u] = best if winner >= 0 else 0.0

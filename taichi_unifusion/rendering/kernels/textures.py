@@ -6,8 +6,9 @@ that see a point agree.
 
 import taichi as ti
 
+from ...kernels.camera import Intrinsics, Pose, move, ray, rotate
 from ...kernels.voxels import Floats2, Floats3, Ints1, Ints2
-from .raster import Image, Pose
+from .raster import Image
 from .solids import CYLINDER, ROOM, SPHERE, TAU, multiply, to_local, uniform
 
 PATTERNS = {
@@ -211,9 +212,9 @@ def daylight(
     """
     shade = 0.58 + 0.08 * n[2]
     for light in ti.static(((-1.5, 0.2, 1.9, 0.34), (0.4, 0.0, 2.3, 0.30))):
-        ray = ti.math.vec3(light[0], light[1], light[2]) - x
-        facing = ti.max(0.0, 0.75 * n.dot(ray.normalized()) + 0.25)
-        shade += light[3] * facing / (0.6 + 0.12 * ray.dot(ray))
+        way = ti.math.vec3(light[0], light[1], light[2]) - x
+        facing = ti.max(0.0, 0.75 * n.dot(way.normalized()) + 0.25)
+        shade += light[3] * facing / (0.6 + 0.12 * way.dot(way))
     wall = ti.min(x - room_low, room_high - x)
     for axis in ti.static(range(3)):
         shade *= 1.0 - 0.22 * (1.0 - ti.abs(n[axis])) * ti.exp(-ti.max(wall[axis], 0.0) / 0.16)
@@ -238,7 +239,7 @@ def ground_light(ground: ti.template(), share: ti.math.vec3) -> ti.f32:
 @ti.kernel
 def shade_surfaces(
     # in:
-    intrinsics: ti.math.vec4,  # fx, fy, cx, cy [px]
+    intrinsics: Intrinsics,
     T_world_camera: Pose,  # (3, 4)
     room: Corners,  # (2, 3) lowest and highest inner corner of the room, world [m]
     depth: Floats2,  # (H, W) [m] of cast_rays
@@ -260,10 +261,8 @@ def shade_surfaces(
         rgb = ti.math.vec3(0.0)
         cosine[v, u] = 0.0
         if j >= 0:
-            ray = ti.math.vec3(
-                (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
-            )
-            at = depth[v, u] * ray
+            direction = ray(u, v, intrinsics)
+            at = depth[v, u] * direction
             half = ti.math.vec3(half_extents[j, 0], half_extents[j, 1], half_extents[j, 2])
             p = to_local(T_local_camera, j, at)
             p += ti.math.vec3(
@@ -275,9 +274,8 @@ def shade_surfaces(
                 for c in ti.static(range(3)):
                     n_camera[c] += T_local_camera[j, r, c] * n_local[r]
             n_camera = n_camera.normalized()
-            cosine[v, u] = ti.abs(n_camera.dot(ray.normalized()))
-            n = T_world_camera @ ti.math.vec4(n_camera, 0.0)
-            x = T_world_camera @ ti.math.vec4(at, 1.0)
+            cosine[v, u] = ti.abs(n_camera.dot(direction.normalized()))
+            n, x = rotate(T_world_camera, n_camera), move(T_world_camera, at)
 
             face = (
                 0 if n_local[0] != 0.0 else (1 if n_local[1] != 0.0 else (2 if p[2] < 0.0 else 3))

@@ -8,8 +8,9 @@ McCormack et al. 1999), so that colour aliases neither inside triangles nor at t
 
 import taichi as ti
 
+from ...kernels.camera import Intrinsics, Pose, ray, rotate
 from ...kernels.voxels import Floats2, Ints1, Ints2, row3
-from .raster import EMPTY, DepthBuffer, Image, Pose, Projection, depth_of, edge_functions, project
+from .raster import EMPTY, DepthBuffer, Image, Projection, depth_of, edge_functions, project
 
 MAX_TAPS = 8  # along the long axis of a footprint; longer ones are blurred
 SLACK = 0.05  # of a tap: a footprint that is square but for rounding takes one
@@ -187,7 +188,7 @@ def read_surfaces(
     faces: Ints2,  # (F, 3)
     face_object: Ints1,  # (F,)
     T_world_camera: Pose,  # (3, 4)
-    intrinsics: ti.math.vec4,  # fx, fy, cx, cy [px]
+    intrinsics: Intrinsics,
     nearest: DepthBuffer,  # (H, W)
     # out:
     depth: Floats2,  # (H, W) [m], 0 where nothing is seen
@@ -201,10 +202,7 @@ def read_surfaces(
             f = ti.cast(nearest[v, u] & ti.i64(0xFFFFFFFF), ti.i32)
             a = row3(vertices, faces[f, 0])
             n = (row3(vertices, faces[f, 1]) - a).cross(row3(vertices, faces[f, 2]) - a)
-            ray = ti.math.vec4(
-                (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0, 0.0
-            )
-            along = T_world_camera @ ray
+            along = rotate(T_world_camera, ray(u, v, intrinsics))
             depth[v, u] = depth_of(nearest[v, u])
             cosine[v, u] = ti.abs(n.dot(along)) / (n.norm() * along.norm() + 1e-20)
             object[v, u] = face_object[f]
