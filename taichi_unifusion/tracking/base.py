@@ -69,8 +69,7 @@ class Verdict(StrEnum):
     GIVEN = "given"  # as read, not touched
     INTERPOLATED = "interpolated"  # between two poses as read
     TRACKED = "tracked"  # aligned to earlier frames
-    # found by its features at a keyframe, which need not be the last one
-    RELOCALISED = "relocalised"
+    RELOCALISED = "relocalised"  # after a loss: found at some keyframe by its features
     REFINED = "refined"  # aligned to earlier frames, close to the pose that was given
     PRIOR_KEPT = "prior kept"  # the pose that was given: the refinement could not be trusted
     LOST = "lost"  # no pose: the frame does not fit what was seen before
@@ -80,7 +79,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """The pose of one frame, how well it fits and what to think of it."""
+    """The pose of one frame, where it comes from and how well it fits."""
 
     index: int  # place in its recording
     verdict: Verdict
@@ -115,12 +114,12 @@ class TrackingResult:
         """Of the frames that have a pose; frame numbers stand in for time stamps where a recording
         has none.
         """
-        posed = [frame for frame in self.frames if frame.T_world_camera is not None]
-        return Trajectory.of(
-            [frame.timestamp for frame in posed],
-            [frame.index for frame in posed],
-            [frame.T_world_camera for frame in posed],
-        )
+        posed = [
+            (frame.timestamp, frame.index, frame.T_world_camera)
+            for frame in self.frames
+            if frame.T_world_camera is not None
+        ]
+        return Trajectory.of(*([row[k] for row in posed] for k in range(3)))
 
 
 @dataclass(frozen=True)

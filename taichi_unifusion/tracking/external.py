@@ -19,7 +19,7 @@ from .base import PoseSource, TrackedFrame, Tracker, TrackingResult, TrackingSet
 from .trajectory_files import ExternalPoses, read_poses
 
 MAX_DIFFERENCE = 0.02  # [s] between a frame and its pose, as TUM's benchmark has it
-# [s] or frames; a longer gap is not interpolated: nobody knows what the camera did in it
+# [s], frames: a longer gap is not interpolated, as the camera may have gone anywhere in it
 LONGEST_GAP = 1.0, 30.0
 
 
@@ -52,7 +52,7 @@ class ExternalPoseTracker(Tracker):
         self.poses, self.interpolate, self.max_difference = poses, interpolate, max_difference
         self.warnings = poses.warnings
         self.frames: list[TrackedFrame] = []
-        self.keys: list[float] = []  # that frames were looked for under
+        self.keys: list[float] = []  # number or time stamp of every frame
 
     def track(self, frame: Frame) -> TrackedFrame:
         verdict, pose, message = self.pose_of(frame)
@@ -62,7 +62,7 @@ class ExternalPoseTracker(Tracker):
         return self.frames[-1]
 
     def pose_of(self, frame: Frame) -> tuple[Verdict, NDArray[np.float64] | None, str]:
-        """Verdict and T_world_camera of a frame, or None and why."""
+        """Verdict and T_world_camera of a frame, or None and why there is none."""
         poses = self.poses
         key, unit, tolerance, longest = self._key(frame)
         self.keys.append(key)
@@ -76,11 +76,10 @@ class ExternalPoseTracker(Tracker):
             between = poses.T_world_camera[after - 1], poses.T_world_camera[after]
             share = (key - poses.keys[after - 1]) / (poses.keys[after] - poses.keys[after - 1])
             return Verdict.INTERPOLATED, interpolate(*between, share), ""
-        return (
-            Verdict.MISSING,
-            None,
-            f"{poses.source}: the nearest pose is {gap:g} {unit.rstrip('s') if gap == 1 and unit != 's' else unit} away",
-        )
+        if gap == 1 and unit == "frames":
+            unit = "frame"
+        message = f"{poses.source}: the nearest pose is {gap:g} {unit} away"
+        return Verdict.MISSING, None, message
 
     def _key(self, frame: Frame) -> tuple[float, str, float, float]:
         """What to look for: number or time stamp, its unit, how far off it may be, the longest gap

@@ -1,5 +1,5 @@
-"""ORB features with depth: recognises a place seen before and says roughly where the camera is in
-it.
+"""ORB features with depth: they recognise a place seen before and say roughly where the camera is
+in it.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from ..types import Frame, PinholeCamera
 FEATURES = 800
 LEAST_WIDTH = 320  # [px] smaller images are enlarged: a corner's surroundings are 31 pixels wide
 RATIO = 0.8  # best against second-best distance of a match
-REPROJECTION = 6.0  # [px] of a match that supports a pose
-MIN_MATCHES = 12  # that support a pose
+REPROJECTION = 6.0  # [px] largest error of a match that supports a pose
+MIN_MATCHES = 12  # that must support a pose
 RANSAC_ITERATIONS = 300
-# of the strongest, that vote for similar keyframes, and that are voted for
+# strongest features used to find similar keyframes: of the frame, and of each keyframe
 QUERY_FEATURES, STORED_FEATURES = 200, 300
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Corners of a frame that have a depth, strongest first; pixels are those of the image that
-    they were found in.
+    """Corners of a frame that have a depth, strongest first; pixels are those of the image, maybe
+    enlarged, that they were found in.
     """
 
     descriptors: NDArray[np.uint8]  # (N, 32)
@@ -53,7 +53,7 @@ def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Featur
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     if scale > 1:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    corners, descriptors = cv2.ORB_create(FEATURES, fastThreshold=10).detectAndCompute(gray, None)
+    corners, descriptors = cv2.ORB.create(FEATURES, fastThreshold=10).detectAndCompute(gray, None)
     if not corners:
         return empty
     pixels = np.array([corner.pt for corner in corners], np.float32)
@@ -72,8 +72,8 @@ def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Featur
 
 
 def most_similar(query: Features, others: Sequence[Features], count: int) -> list[int]:
-    """Numbers of the `count` of `others` that most of the query's strongest features find their
-    nearest neighbour in.
+    """Numbers of the `count` of `others` in which most of the query's strongest features have their
+    nearest neighbour.
     """
     sizes = [min(len(other), STORED_FEATURES) for other in others]
     if not len(query) or not sum(sizes):

@@ -1,6 +1,4 @@
-"""Internal tracking: poses that are given, refined by colored ICP against recent keyframes (Sec.
-V-A.1).
-"""
+"""Internal tracking: given poses, refined by colored ICP against recent keyframes (Sec. V-A.1)."""
 
 from __future__ import annotations
 
@@ -13,22 +11,22 @@ from ..types import Frame
 from .base import PoseSource, TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
 from .external import ExternalPoseTracker
 from .given import GivenPoses
-from .odometry import KeyframeOdometry, View
+from .odometry import KeyframeOdometry, PreparedFrame
 from .pose_graph import Edge, Prior
 from .registration import Registration
 
-WINDOW = 3  # keyframes, at least
-PRIOR_SIGMA = np.array([0.02] * 3 + [np.radians(1.0)] * 3)  # [m, rad] of a given pose
-# of the motion between two given poses that are near
+WINDOW = 3  # keyframes that a frame is aligned to, at least
+# Standard deviations [m, rad] of a given pose, and of the motion between two neighbouring ones
+PRIOR_SIGMA = np.array([0.02] * 3 + [np.radians(1.0)] * 3)
 GIVEN_SIGMA = np.array([0.01] * 3 + [np.radians(0.5)] * 3)
 
 
 class InternalTracker(Tracker):
-    """Refines the poses of another tracker; one that cannot be trusted stays as it was, relative to
-    its keyframe.
+    """Refines the poses of another tracker; where a refinement cannot be trusted, the frame keeps
+    its given pose relative to its keyframe.
 
-    Keyframes are held near their given poses while they are aligned to each other, so that a
-    globally consistent trajectory stays so.
+    The pose graph has a prior at each keyframe's given pose, so that a globally consistent
+    trajectory stays so.
     """
 
     reads_trajectory = True
@@ -53,32 +51,34 @@ class InternalTracker(Tracker):
 
     def track(self, frame: Frame) -> TrackedFrame:
         odometry, given = self.odometry, self.prior.track(frame)
-        if given.T_world_camera is None:
+        T_world_prior = given.T_world_camera
+        if T_world_prior is None:
             return odometry.give_up(given.index, given.timestamp, given.verdict, given.message)
-        view = odometry.view(frame)
+        prepared = odometry.prepare(frame)
         if not len(odometry.keyframes):
-            return self._start(view, given, "")
+            return self._start(prepared, T_world_prior, given.verdict, "")
         reference = odometry.reference
-        T_reference_prior = se3.inverse(self.T_world_prior[reference]) @ given.T_world_camera
+        T_reference_prior = se3.inverse(self.T_world_prior[reference]) @ T_world_prior
         guess = odometry.keyframes.T_world_keyframe[reference] @ T_reference_prior
-        if view.blank:
-            return odometry.place(view, Verdict.PRIOR_KEPT, T_reference_prior, None, view.blank)
-        found, problem = odometry.align(view, guess, max(WINDOW, self.settings.window))
+        if prepared.blank:
+            return odometry.place(
+                prepared, Verdict.PRIOR_KEPT, T_reference_prior, None, prepared.blank
+            )
+        found, problem = odometry.align(prepared, guess, max(WINDOW, self.settings.window))
         problem = problem or self._too_far(found, T_reference_prior)
         if (
             problem
             and se3.distance(np.eye(4), T_reference_prior)[0] > 2 * self.settings.keyframe_distance
         ):
-            # a gap: what comes next is aligned to this frame
-            return self._start(view, given, problem)
+            # too far from the keyframe: the next frames are aligned to this one
+            return self._start(prepared, T_world_prior, Verdict.PRIOR_KEPT, problem)
         pose = T_reference_prior if problem else found.T_target_source
         tracked = odometry.place(
-            view, Verdict.PRIOR_KEPT if problem else Verdict.REFINED, pose, found, problem
+            prepared, Verdict.PRIOR_KEPT if problem else Verdict.REFINED, pose, found, problem
         )
         if not problem and odometry.is_far(found):
-            self._add_keyframe(
-                view, given, odometry.keyframes.T_world_keyframe[reference] @ pose, found
-            )
+            T_world_camera = odometry.keyframes.T_world_keyframe[reference] @ pose
+            self._add_keyframe(prepared, T_world_prior, T_world_camera, found)
         return tracked
 
     def skip(self, index: int, error: Exception) -> TrackedFrame:
@@ -86,33 +86,39 @@ class InternalTracker(Tracker):
         return self.odometry.give_up(index, None, skipped.verdict, skipped.message)
 
     def finish(self) -> TrackingResult:
-        details = dict(self.prior.finish().details)
-        return self.odometry.result(**details)
+        return self.odometry.result(self.prior.finish().details)
 
     def _too_far(self, found: Registration, T_reference_prior: NDArray) -> str:
         distance, angle = se3.distance(T_reference_prior, found.T_target_source)
         if distance > self.settings.prior_distance or np.degrees(angle) > self.settings.prior_angle:
-            return f"alignment went {100 * distance:.1f} cm and {np.degrees(angle):.1f} degrees away from the given pose"
+            return (
+                f"alignment went {100 * distance:.1f} cm and {np.degrees(angle):.1f} degrees away "
+                "from the given pose"
+            )
         return ""
 
-    def _start(self, view: View, given: TrackedFrame, problem: str) -> TrackedFrame:
-        """A keyframe that is where it was given, because of a problem or as the first; the next
-        ones are aligned to it.
+    def _start(
+        self, prepared: PreparedFrame, T_world_prior: NDArray, verdict: Verdict, problem: str
+    ) -> TrackedFrame:
+        """Make the frame a keyframe at its given pose: it is the first, or alignment to the one
+        before failed (`problem`).
         """
-        self._add_keyframe(view, given, given.T_world_camera, None)
-        return self.odometry.place(
-            view, Verdict.PRIOR_KEPT if problem else given.verdict, np.eye(4), None, problem
-        )
+        self._add_keyframe(prepared, T_world_prior, T_world_prior, None)
+        return self.odometry.place(prepared, verdict, np.eye(4), None, problem)
 
     def _add_keyframe(
-        self, view: View, given: TrackedFrame, T_world_camera: NDArray, found: Registration | None
+        self,
+        prepared: PreparedFrame,
+        T_world_prior: NDArray,
+        T_world_camera: NDArray,
+        found: Registration | None,
     ) -> None:
         odometry, before = self.odometry, self.odometry.reference
-        number = odometry.add_keyframe(view, se3.normalized(T_world_camera), found)
-        self.T_world_prior.append(given.T_world_camera)
-        odometry.priors.append(Prior(number, given.T_world_camera, np.diag(PRIOR_SIGMA**-2)))
+        number = odometry.add_keyframe(prepared, se3.normalized(T_world_camera), found)
+        self.T_world_prior.append(T_world_prior)
+        odometry.priors.append(Prior(number, T_world_prior, np.diag(PRIOR_SIGMA**-2)))
         if number and found is None:
-            motion = se3.inverse(self.T_world_prior[before]) @ given.T_world_camera
+            motion = se3.inverse(self.T_world_prior[before]) @ T_world_prior
             odometry.edges.append(Edge(before, number, motion, np.diag(GIVEN_SIGMA**-2)))
         elif number:
             odometry.link_keyframe(number, by_appearance=False)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from .features import Features
 from .pyramid import ReducedFrame, SurfelPyramid, build_pyramid
 
-GRID = 16  # [px] between points that stand for a keyframe where the overlap of two is estimated
+GRID = 16  # [px] between the points by which the overlap of two keyframes is estimated
 NEAR = 0.05  # [m] nothing nearer to a camera is compared
 SAME_DEPTH = 0.1  # share of the depth by which a point and a reading may differ
-LIVE_PYRAMIDS = 24  # 3 MB each; older ones are built again from their images when needed
+LIVE_PYRAMIDS = 24  # of 3 MB each; older ones are built again from their images when needed
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Keyframe:
         return camera.rays(u, v)[q > 0] / q[q > 0][:, None]
 
     def overlap(self, other: Keyframe, T_other_self: NDArray) -> float:
-        """Share of its points that the other keyframe sees where it should."""
+        """Share of its points at which the other keyframe measured the depth expected there."""
         if not len(self.points):
             return 0.0
         points = (T_other_self[:3, :3] @ self.points.T + T_other_self[:3, 3:]).T  # in `other`
@@ -44,8 +44,8 @@ class Keyframe:
 
 
 class Keyframes:
-    """Keyframes by number, in order, with their poses as known now; builds pyramids when they are
-    asked for.
+    """Keyframes by number, in order, with their present poses; builds pyramids when they are asked
+    for.
     """
 
     def __init__(self) -> None:

@@ -11,18 +11,18 @@ from .keyframes import Keyframes
 from .pose_graph import Edge
 from .registration import Registration, register
 
-NEAR = 6  # keyframes that are neighbours in time
-NEIGHBORS = 2  # of them, so many are aligned beside the one before
-LOOPS = 2  # older keyframes that are aligned at most, by place and by appearance each
-MIN_OVERLAP = 0.3  # of a pair that is worth aligning
-# of a pair that is believed; stricter than from frame to frame
+NEAR = 6  # how far back a keyframe counts as recent
+NEIGHBORS = 2  # how many recent ones, besides the previous, get an edge
+LOOPS = 2  # how many loop candidates are tried, by position and by appearance each
+EXPECTED_OVERLAP = 0.3  # overlap, by the poses as they are, from which on a pair is aligned
+# What an alignment of two keyframes must reach to become an edge; stricter than for a frame
 LOOP_OVERLAP, LOOP_AGREEMENT = 0.25, 0.75
-LOOP_UNCERTAINTY = 0.02  # [m] of its translation in the weakest direction
-MAX_CORRECTION = 0.3, np.radians(15)  # [m, rad] by which alignment may move what features found
+LOOP_UNCERTAINTY = 0.02  # [m] of the translation in its weakest direction
+LOOP_CORRECTION = 0.3, np.radians(15)  # [m, rad] a result farther from its guess is wrong
 
 
 def neighbor_edges(keyframes: Keyframes, number: int, photometric_weight: float) -> list[Edge]:
-    """A keyframe aligned to recent ones beside the one before it."""
+    """Edges of a keyframe to recent ones, besides the previous."""
     recent = _by_overlap(keyframes, number, range(max(0, number - NEAR), number - 1))
     return [
         edge
@@ -34,8 +34,8 @@ def neighbor_edges(keyframes: Keyframes, number: int, photometric_weight: float)
 def find_loops(
     keyframes: Keyframes, number: int, photometric_weight: float, by_appearance: bool
 ) -> list[Edge]:
-    """A keyframe aligned to older ones: to those that it should see if its pose is right, and to
-    those that look like it.
+    """Edges of a keyframe to older ones: to those that it should see if its pose is right, or, if
+    there is none, to those that look like it.
     """
     older = range(max(0, number - NEAR))
     edges = [
@@ -55,14 +55,14 @@ def find_loops(
 
 
 def _by_overlap(keyframes: Keyframes, number: int, others: range) -> list[int]:
-    """Those of `others` that should see what the keyframe sees, most of it first."""
+    """Those of `others` that overlap the keyframe by the poses as they are, most first."""
     found = []
     for other in others:
         T_other_number = (
             se3.inverse(keyframes.T_world_keyframe[other]) @ keyframes.T_world_keyframe[number]
         )
         overlap = keyframes.items[number].overlap(keyframes.items[other], T_other_number)
-        if overlap > MIN_OVERLAP:
+        if overlap > EXPECTED_OVERLAP:
             found.append((-overlap, other))
     return [other for _, other in sorted(found)]
 
@@ -75,8 +75,8 @@ def _edge(
     guess: NDArray | None,
     loop: bool = False,
 ) -> Edge | None:
-    """Keyframe `number` aligned to `other`, or None where that is not to be believed; `guess` is
-    T_other_number.
+    """Keyframe `number` aligned to `other`, or None where the result is not believable; `guess` is
+    T_other_number, None: from the poses as they are.
     """
     if guess is None:
         guess = se3.inverse(keyframes.T_world_keyframe[other]) @ keyframes.T_world_keyframe[number]
@@ -87,13 +87,13 @@ def _edge(
 
 
 def believable(found: Registration, guess: NDArray) -> bool:
-    """Whether two keyframes really see the same from there."""
+    """Whether an alignment of two keyframes is good enough for an edge."""
     distance, angle = se3.distance(guess, found.T_target_source)
     return (
         found.overlap > LOOP_OVERLAP
         and found.agreement > LOOP_AGREEMENT
         and found.determined
         and found.uncertainty[-1] < LOOP_UNCERTAINTY
-        and distance < MAX_CORRECTION[0]
-        and angle < MAX_CORRECTION[1]
+        and distance < LOOP_CORRECTION[0]
+        and angle < LOOP_CORRECTION[1]
     )

@@ -1,11 +1,11 @@
-"""Frames aligned to keyframes, keyframes aligned to each other: the part that the built-in trackers
-share.
-"""
+"""Frames aligned to keyframes and keyframes to each other: what the built-in trackers share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,25 +21,31 @@ from .pose_graph import Edge, Prior, optimize
 from .pyramid import ReducedFrame, SurfelPyramid, build_pyramid, reduce_frame
 from .registration import Registration, Target, register
 
-MIN_SURFELS = 0.03  # share of the image
-MIN_OVERLAP = 0.25
-MIN_AGREEMENT = 0.65  # of what is in view; right alignments leave 0.84 to 0.98
-SURE_AGREEMENT = 0.8  # where nobody knows how far the camera went
-MAX_CORRECTION = 0.3, np.radians(20)  # [m, rad] farther from the guess alignment only goes astray
+MIN_SURFELS = 0.03  # smallest share of the image with usable depth that can be aligned
+# An alignment of a frame to its keyframe is trusted from these shares on: of the frame that meets
+# the keyframe, and of that part that lies on the keyframe's surface (right ones have 0.84 to 0.98).
+FRAME_OVERLAP, FRAME_AGREEMENT = 0.25, 0.65
+SURE_AGREEMENT = 0.8  # the same after a loss, when the camera may be far from where it was
+FRAME_CORRECTION = 0.3, np.radians(20)  # [m, rad] a result farther from its guess is wrong
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A frame as the trackers need it."""
+class PreparedFrame:
+    """A frame with what it is aligned by."""
 
     frame: Frame
     reduced: ReducedFrame
     pyramid: SurfelPyramid
-    features: Callable[[], Features]  # found when asked for: most frames never need them
+    depth_range: tuple[float, float]  # [m]
+
+    @cached_property
+    def features(self) -> Features:
+        """Found when asked for: most frames never need them."""
+        return extract_features(self.frame, *self.depth_range)
 
     @property
     def blank(self) -> str:
-        """Why nothing can be aligned to this frame, or nothing."""
+        """Why this frame cannot be aligned; empty if it can."""
         share = float((self.reduced.inverse > 0).mean())
         return f"only {share:.1%} of the image has usable depth" if share < MIN_SURFELS else ""
 
@@ -51,8 +57,8 @@ class Placement:
     """
 
     tracked: TrackedFrame
-    keyframe: int | None = None  # number among the keyframes
-    T_keyframe_camera: NDArray[np.float64] | None = None
+    keyframe: int | None = None  # number among the keyframes; None: the frame has no pose
+    T_keyframe_camera: NDArray[np.float64] | None = None  # (4, 4)
 
 
 class KeyframeOdometry:
@@ -68,23 +74,20 @@ class KeyframeOdometry:
         self.reference = 0  # number of the keyframe that frames are aligned to
         self.optimizations = 0
 
-    def view(self, frame: Frame) -> View:
-        """The frame's pyramid, and its features when they are asked for."""
+    def prepare(self, frame: Frame) -> PreparedFrame:
+        """Build the frame's pyramid."""
         reduced = reduce_frame(frame, *self.depth_range)
-        found: list[Features] = []
-
-        def features() -> Features:
-            if not found:
-                found.append(extract_features(frame, *self.depth_range))
-            return found[0]
-
-        return View(frame, reduced, build_pyramid(reduced), features)
+        return PreparedFrame(frame, reduced, build_pyramid(reduced), self.depth_range)
 
     def align(
-        self, view: View, T_world_camera: NDArray, window: int = 1, agreement: float = MIN_AGREEMENT
+        self,
+        prepared: PreparedFrame,
+        T_world_camera: NDArray,
+        window: int = 1,
+        agreement: float = FRAME_AGREEMENT,
     ) -> tuple[Registration, str]:
-        """The view relative to the reference keyframe, from a guess, and why that is not to be
-        trusted, if so.
+        """The frame relative to the reference keyframe, from the guess `T_world_camera`, and why
+        the result cannot be trusted; empty if it can.
         """
         poses, newest = self.keyframes.T_world_keyframe, self.reference
         targets = [
@@ -92,20 +95,22 @@ class KeyframeOdometry:
             for k in range(max(0, newest - window + 1), newest + 1)
         ]
         guess = se3.inverse(poses[newest]) @ T_world_camera
-        found = register(view.pyramid, targets, guess, self.settings.photometric_weight)
+        found = register(prepared.pyramid, targets, guess, self.settings.photometric_weight)
         return found, problem_of(found, guess, agreement)
 
     def add_keyframe(
-        self, view: View, T_world_camera: NDArray, registration: Registration | None
+        self, prepared: PreparedFrame, T_world_camera: NDArray, registration: Registration | None
     ) -> int:
-        """Make the view a keyframe; `registration` is its alignment to the reference keyframe,
-        whose place it takes.
+        """Make the frame a keyframe and the new reference; `registration` is its alignment to the
+        reference before it. Returns its number.
         """
-        keyframe = Keyframe(view.frame.index, view.reduced, view.features())
-        before, number = self.reference, self.keyframes.add(keyframe, view.pyramid, T_world_camera)
+        keyframe = Keyframe(prepared.frame.index, prepared.reduced, prepared.features)
+        before = self.reference
+        number = self.keyframes.add(keyframe, prepared.pyramid, T_world_camera)
         if registration is not None:
             self.edges.append(Edge.of(before, number, registration))
-            if self.placements[-1].tracked.index == keyframe.index:  # it moves with itself now
+            # from now on the frame is its own keyframe: identity pose
+            if self.placements[-1].tracked.index == keyframe.index:
                 self.placements[-1] = replace(
                     self.placements[-1], keyframe=number, T_keyframe_camera=np.eye(4)
                 )
@@ -113,7 +118,7 @@ class KeyframeOdometry:
         return number
 
     def link_keyframe(self, number: int, by_appearance: bool) -> None:
-        """Align a new keyframe to others that see the same, near ones and such as close a loop."""
+        """Add edges from a new keyframe to recent ones, and to older ones that close a loop."""
         weight = self.settings.photometric_weight
         self.edges += neighbor_edges(self.keyframes, number, weight)
         if not self.settings.loops:
@@ -121,18 +126,18 @@ class KeyframeOdometry:
         loops = find_loops(self.keyframes, number, weight, by_appearance)
         self.edges += loops
         if any(edge.contradicts(self.keyframes.T_world_keyframe) for edge in loops):
-            # at once: the next loops are looked for where the camera is now thought to be
+            # at once: loops of the next keyframes are looked for from the corrected poses
             self.optimize()
 
     def optimize(self) -> None:
-        """Move the keyframes to where all edges and priors agree best."""
+        """Move the keyframes to the poses that fit all edges and priors best."""
         if self.edges:
             graph = optimize(self.keyframes.T_world_keyframe, self.edges, self.priors)
             self.keyframes.T_world_keyframe = list(graph.T_world_node)
             self.optimizations += 1
 
     def is_far(self, registration: Registration) -> bool:
-        """Whether a frame shares so little with its keyframe that it becomes one."""
+        """Whether a frame is so far from its keyframe that it becomes one itself."""
         distance, angle = se3.distance(np.eye(4), registration.T_target_source)
         s = self.settings
         return (
@@ -143,7 +148,7 @@ class KeyframeOdometry:
 
     def place(
         self,
-        view: View,
+        prepared: PreparedFrame,
         verdict: Verdict,
         T_keyframe_camera: NDArray,
         registration: Registration | None = None,
@@ -158,10 +163,10 @@ class KeyframeOdometry:
             else {"fitness": registration.fitness, "rmse": registration.rmse}
         )
         tracked = TrackedFrame(
-            view.frame.index,
+            prepared.frame.index,
             verdict,
             self.keyframes.T_world_keyframe[keyframe] @ T_keyframe_camera,
-            view.frame.timestamp,
+            prepared.frame.timestamp,
             keyframe=self.keyframes.items[keyframe].index,
             message=message,
             **fit,
@@ -177,13 +182,13 @@ class KeyframeOdometry:
         self.placements.append(Placement(tracked))
         return tracked
 
-    def result(self, **details) -> TrackingResult:
+    def result(self, details: Mapping[str, Any] | None = None) -> TrackingResult:
         """All frames with poses that follow from the optimised keyframes."""
         self.optimize()
         frames = []
         for placement in self.placements:
             pose = None
-            if placement.keyframe is not None:
+            if placement.keyframe is not None and placement.T_keyframe_camera is not None:
                 pose = se3.normalized(
                     self.keyframes.T_world_keyframe[placement.keyframe]
                     @ placement.T_keyframe_camera
@@ -191,25 +196,27 @@ class KeyframeOdometry:
             frames.append(replace(placement.tracked, T_world_camera=pose))
         indices = [keyframe.index for keyframe in self.keyframes.items]
         loops = tuple((indices[edge.a], indices[edge.b]) for edge in self.edges if edge.loop)
-        details = {
+        counts = {
             "keyframes": len(indices),
             "edges": len(self.edges),
             "loops": len(loops),
             "optimizations": self.optimizations,
-            **details,
         }
-        return TrackingResult(tuple(frames), tuple(indices), loops, details)
+        return TrackingResult(tuple(frames), tuple(indices), loops, {**counts, **(details or {})})
 
 
-def problem_of(found: Registration, guess: NDArray, agreement: float = MIN_AGREEMENT) -> str:
-    """Why an alignment is not to be trusted, or nothing."""
+def problem_of(found: Registration, guess: NDArray, agreement: float = FRAME_AGREEMENT) -> str:
+    """Why an alignment cannot be trusted; empty if it can."""
     distance, angle = se3.distance(guess, found.T_target_source)
-    if found.overlap < MIN_OVERLAP:
+    if found.overlap < FRAME_OVERLAP:
         return f"only {found.overlap:.0%} of the frame overlaps its keyframe"
     if found.agreement < agreement:
         return f"only {found.agreement:.0%} of the overlap lies on the surface that was seen before"
     if not found.determined:
         return "what the frame sees does not tell where the camera is (a blank wall?)"
-    if distance > MAX_CORRECTION[0] or angle > MAX_CORRECTION[1]:
-        return f"alignment went astray ({distance:.2f} m, {np.degrees(angle):.0f} degrees from where the camera was expected)"
+    if distance > FRAME_CORRECTION[0] or angle > FRAME_CORRECTION[1]:
+        return (
+            f"alignment went astray ({distance:.2f} m, {np.degrees(angle):.0f} degrees from where "
+            "the camera was expected)"
+        )
     return ""

@@ -1,8 +1,7 @@
 """Pose graph: Gauss-Newton on SE(3) with robust loop edges (Grisetti et al. 2010; Yang et al.
 2020).
 
-A few sparse matrices, no library beside SciPy: a map needs nothing but the base installation.
-Open3D's optimiser is the test's oracle.
+Needs no library besides SciPy's sparse matrices. Open3D's optimiser is the test's oracle.
 """
 
 from __future__ import annotations
@@ -18,13 +17,14 @@ from .registration import Registration
 
 ITERATIONS = 60
 CONVERGED = 1e-6  # [m, rad] largest change of a pose
-LOOP_SCALE = 100.0  # squared Mahalanobis distance at which a loop edge counts a quarter
-ANNEALING = 2.0  # by which that scale shrinks from step to step, from the largest distance on
+LOOP_SCALE = 100.0  # squared Mahalanobis distance at which a loop edge has a quarter of its weight
+# that scale starts at the largest squared distance and is divided by this from step to step
+ANNEALING = 2.0
 ANCHOR = 1e12  # information that holds the first pose
 CONTRADICTION = 20.0  # squared Mahalanobis distance that one in 400 right edges exceeds
-# [m, rad] that calibration leaves of every alignment
+# [m, rad] smallest standard deviations of an alignment: calibration is no better
 FLOOR = np.array([0.003] * 3 + [np.radians(0.15)] * 3)
-BLIND = 1e-6  # information that a direction has at least, so that its inverse exists
+BLIND = 1e-6  # added to the information, so that its inverse exists where a direction is open
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Edge:
     b: int
     T_a_b: NDArray[np.float64]  # (4, 4)
     information: NDArray[np.float64]  # (6, 6) of a twist on the right of T_a_b
-    robust: bool = False  # may be wrong altogether
+    robust: bool = False  # may be an outlier
     loop: bool = False  # joins keyframes that are not neighbours in time
 
     @classmethod
@@ -55,7 +55,7 @@ class Edge:
         )
 
     def contradicts(self, T_world_node: Sequence[NDArray]) -> bool:
-        """Whether the poses as they are now do not fit this edge."""
+        """Whether the present poses do not fit this edge."""
         e = se3.log(
             se3.inverse(self.T_a_b) @ se3.inverse(T_world_node[self.a]) @ T_world_node[self.b]
         )
@@ -73,7 +73,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class OptimizedGraph:
-    """Poses of all nodes, and how far the loop edges were trusted."""
+    """Poses of all nodes, and the weights that the robust edges ended with."""
 
     T_world_node: NDArray[np.float64]  # (N, 4, 4)
     weights: NDArray[np.float64]  # (E,) 1 for edges that are not robust
@@ -85,13 +85,14 @@ def optimize(
 ) -> OptimizedGraph:
     """Poses that fit all edges and priors; without priors the first pose stays as it is.
 
-    Robust edges have Geman-McClure's weight, whose scale shrinks from where it trusts all of them:
-    drift is pulled in before an edge that contradicts the others loses its say.
+    Robust edges have Geman-McClure's weight. Its scale begins so wide that all of them count and
+    shrinks: drift is corrected before an edge that contradicts the others loses its weight.
     """
     T = np.array(T_world_node, np.float64).reshape(-1, 4, 4)
     stacked = _stack(edges)
-    scale, weights, step = np.inf, np.ones(len(edges)), 0
-    for step in range(1, ITERATIONS + 1):
+    scale, weights, iterations = np.inf, np.ones(len(edges)), 0
+    while iterations < ITERATIONS:
+        iterations += 1
         residuals = se3.log(se3.inverse(stacked.T_a_b) @ se3.inverse(T[stacked.a]) @ T[stacked.b])
         squared = np.einsum("ei,eij,ej->e", residuals, stacked.information, residuals)
         scale = max(LOOP_SCALE, min(scale / ANNEALING, squared[stacked.robust].max(initial=0.0)))
@@ -100,7 +101,7 @@ def optimize(
         T = se3.normalized(T @ se3.exp(twists))
         if np.abs(twists).max(initial=0.0) < CONVERGED and scale == LOOP_SCALE:
             break
-    return OptimizedGraph(T, weights, step)
+    return OptimizedGraph(T, weights, iterations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +158,6 @@ def _solve(
 
 
 def with_floor(information: NDArray) -> NDArray[np.float64]:
-    """Information of an alignment that is never better than `FLOOR`."""
+    """Information of an alignment, never better than `FLOOR`."""
     covariance = np.linalg.inv(information + BLIND * np.eye(6)) + np.diag(FLOOR**2)
-    return np.linalg.inv(covariance)
+    return np.asarray(np.linalg.inv(covariance), np.float64)

@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..types import Frame, PinholeCamera
 
-FINEST_WIDTH = 320  # [px] at least; finer images add time and noise, no accuracy
-SMALLEST = 24  # [px] shorter side of the coarsest level
+# [px] wider images are averaged to at least this width; finer ones add time and noise, no accuracy
+FINEST_WIDTH = 320
+SMALLEST = 24  # [px] least shorter side of a level
 NORMAL_RADIUS = (3, 2, 2)  # [px] by level, finest first
-EDGE_JUMP = 0.03  # of the depth between pixels of one surface, in an image of FINEST_WIDTH or more
-EDGE_SUPPORT = 5  # as in preprocessing
+# as in preprocessing; the jump is for images of FINEST_WIDTH or more
+EDGE_JUMP, EDGE_SUPPORT = 0.03, 5
 MAX_ANGLE = 80.0  # [degrees] between ray and normal
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedFrame:
-    """What of a frame is enough to build its pyramid again: the finest level's images."""
+    """The images of a frame's finest level, from which its pyramid can be built again."""
 
     inverse: NDArray[np.float32]  # (h, w) [1/m], 0: none
     intensity: NDArray[np.float16]  # (h, w) in [0, 1]; zero where the frame has no colour
@@ -108,7 +109,7 @@ def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
 
 
 def edge_jump(camera: PinholeCamera) -> float:
-    """By which share of the depth neighbouring pixels of one surface may differ: the more, the
-    fewer pixels see it.
+    """Share of the depth by which neighbouring pixels of one surface may differ: more in a coarser
+    image.
     """
     return EDGE_JUMP * max(1.0, FINEST_WIDTH / camera.width)

@@ -15,16 +15,18 @@ from .pyramid import SurfelPyramid
 
 ITERATIONS = (8, 10, 12)  # at most, by level, finest first
 GATES = (0.04, 0.08, 0.16)  # [m] farthest distance of an inlier from the other's plane
-USED_WIDTH = 160  # pixels of the source in a row that are used of a wider image, at least
+USED_WIDTH = 160  # [px] a wider source image is thinned to at least this many pixels a row
 MAX_ANGLE = 25.0  # [degrees] between the normals of inliers
 ROBUST_WIDTH = 1.0  # [standard deviations] a distance that counts half
 CONVERGED = 1e-4  # [m, rad] a step below it ends a level
 FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.005  # of intensities in [0, 1]
-DAMPING = 1e-9  # of the mean diagonal: keeps a blind direction solvable
+DAMPING = 1e-9  # times the trace: keeps the equations solvable where a direction is open
 MAX_UNCERTAINTY = 0.05  # [m] of the translation in its weakest direction
-# of it to that in its best direction; rooms leave 2 to 6, blank walls 14 to 66
+# largest ratio of the translation's uncertainty in its weakest and its best direction; rooms have 2
+# to 6, blank walls 14 to 66
 MAX_AMBIGUITY = 10.0
-# neighbouring pixels err alike: an image counts as so many measurements, however many it has
+# errors of neighbouring pixels are correlated: an image counts as this many independent
+# measurements, whatever its size
 INDEPENDENT = 192.0
 
 
@@ -56,8 +58,8 @@ class Registration:
 
     @property
     def determined(self) -> bool:
-        """Whether what is seen tells where the camera is; along a blank wall only the noise of its
-        normals does.
+        """Whether the frame fixes the camera's position; along a blank wall only the noise of its
+        normals would.
         """
         best, _, weakest = self.uncertainty
         return bool(weakest < MAX_UNCERTAINTY and weakest < MAX_AMBIGUITY * best)
@@ -65,7 +67,7 @@ class Registration:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A frame to align to, and where it lies relative to the frame of reference of the result."""
+    """A frame to align to, and where it lies in the frame of reference of the result."""
 
     pyramid: SurfelPyramid
     T_target_reference: NDArray[np.float64]
@@ -101,7 +103,7 @@ def register(
 def evaluate(
     source: SurfelPyramid, target: SurfelPyramid, T_target_source: NDArray, level: int = 0
 ) -> Registration:
-    """How well `source` fits at a pose that is given."""
+    """How well `source` fits at a given pose."""
     return _result(
         T_target_source,
         _sum(source, [Target(target, np.eye(4))], T_target_source, level, FIRST_SIGMA, 0.0),
@@ -110,13 +112,13 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Equations:
-    """H twist = -b of one Gauss-Newton step, and what the sums say beside it."""
+    """H twist = -b of one Gauss-Newton step, and the counts summed with it."""
 
     H: NDArray[np.float64]  # (6, 6)
     b: NDArray[np.float64]  # (6,)
-    counts: NDArray[np.float64]
+    counts: NDArray[np.float64]  # (SUMS,) columns as in kernels/registration.py
     sigma: float  # of intensity residuals
-    pixels: float  # of the source that were used, whether they have a reading or not
+    pixels: float  # used pixels of the source, with or without a reading
 
 
 def _sum(

@@ -1,8 +1,8 @@
 """The built-in RGB-D tracker: poses from frames alone.
 
-Every frame is aligned to the last keyframe, from where its motion so far would take it; keyframes
-are aligned to all that see the same, loops included, and a pose graph spreads what does not fit. A
-frame that fits nowhere gets no pose; the next ones are looked for by their features.
+Every frame is aligned to the last keyframe, starting from a constant-motion guess; keyframes are
+aligned to all others that see the same surface, loops included, and a pose graph distributes the
+drift. A frame that fits nowhere gets no pose; the next ones are relocalised by their features.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..types import Frame
 from .base import PoseSource, TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
 from .features import locate, most_similar
 from .loop_closure import believable
-from .odometry import MIN_AGREEMENT, SURE_AGREEMENT, KeyframeOdometry, Placement, View
+from .odometry import FRAME_AGREEMENT, SURE_AGREEMENT, KeyframeOdometry, Placement, PreparedFrame
 from .registration import Registration, register
 
 CANDIDATES = 3  # keyframes that a lost frame is compared with
@@ -43,31 +43,29 @@ class RgbdTracker(Tracker):
         preprocess: PreprocessSettings | None = None,
         T_world_first: NDArray = T_WORLD_FIRST,
     ) -> None:
-        self.settings, self.preprocess = (
-            settings or TrackingSettings(),
-            preprocess or PreprocessSettings(),
-        )
+        self.settings = settings or TrackingSettings()
+        self.preprocess = preprocess or PreprocessSettings()
         self.odometry = KeyframeOdometry(self.settings, self.preprocess)
         self.T_world_first = np.array(T_world_first, np.float64)
-        self.motion = np.eye(4)  # from the frame before last to the last one, in camera coordinates
-        self.T_world_camera: NDArray | None = None  # of the last frame that was tracked
+        self.motion = np.eye(4)  # T_before_last: of the last frame in the frame before it
+        self.T_world_camera = self.T_world_first  # of the last frame that was tracked
         self.lost = False
 
     def track(self, frame: Frame) -> TrackedFrame:
         odometry = self.odometry
-        view = odometry.view(frame)
-        if view.blank:
-            return self._give_up(frame, view.blank)
+        prepared = odometry.prepare(frame)
+        if prepared.blank:
+            return self._give_up(frame, prepared.blank)
         if not len(odometry.keyframes):
-            return self._start(view)
-        found, problem = self._align(view)
+            return self._start(prepared)
+        found, problem = self._align(prepared)
         if found is not None:
-            return self._accept(view, found, Verdict.TRACKED)
-        if (place := self._relocalise(view)) is not None:
+            return self._accept(prepared, found, Verdict.TRACKED)
+        if (place := self._relocalise(prepared)) is not None:
             odometry.reference, found = place
-            return self._accept(view, found, Verdict.RELOCALISED)
+            return self._accept(prepared, found, Verdict.RELOCALISED)
         if sum(placement.keyframe is not None for placement in odometry.placements) == 1:
-            return self._restart(view)
+            return self._restart(prepared)
         return self._give_up(frame, problem)
 
     def skip(self, index: int, error: Exception) -> TrackedFrame:
@@ -77,13 +75,13 @@ class RgbdTracker(Tracker):
     def finish(self) -> TrackingResult:
         return self.odometry.result()
 
-    def _start(self, view: View) -> TrackedFrame:
-        self.odometry.add_keyframe(view, self.T_world_first, None)
+    def _start(self, prepared: PreparedFrame) -> TrackedFrame:
+        self.odometry.add_keyframe(prepared, self.T_world_first, None)
         self.T_world_camera = self.T_world_first
-        return self.odometry.place(view, Verdict.TRACKED, np.eye(4))
+        return self.odometry.place(prepared, Verdict.TRACKED, np.eye(4))
 
-    def _restart(self, view: View) -> TrackedFrame:
-        """Begin with this view: nothing ever fitted the first one."""
+    def _restart(self, prepared: PreparedFrame) -> TrackedFrame:
+        """Start over here: no frame could be aligned to the first keyframe; its frames become LOST."""
         before, self.odometry = self.odometry, KeyframeOdometry(self.settings, self.preprocess)
         for placement in before.placements:
             lost = placement.tracked
@@ -97,66 +95,67 @@ class RgbdTracker(Tracker):
                 )
             self.odometry.placements.append(Placement(lost))
         self.lost, self.motion = False, np.eye(4)
-        return self._start(view)
+        return self._start(prepared)
 
-    def _align(self, view: View) -> tuple[Registration | None, str]:
-        """Alignment to the reference keyframe from where the camera may be, the likeliest guess
-        first.
+    def _align(self, prepared: PreparedFrame) -> tuple[Registration | None, str]:
+        """Alignment to the reference keyframe from several guesses, the likeliest first; or None
+        and why the first of them failed.
         """
         problem = ""
         guesses = [
             lambda: self.T_world_camera @ self.motion,
             lambda: self.T_world_camera,
-            lambda: self._by_features(view),
+            lambda: self._by_features(prepared),
         ]
-        # after a loss nobody knows how far the camera went
+        # after a loss the motion is unknown: features first, then the last known pose
         for guess in guesses[:0:-1] if self.lost else guesses:
             if (T_world_camera := guess()) is None:
                 continue
             found, wrong = self.odometry.align(
-                view,
+                prepared,
                 T_world_camera,
                 self.settings.window,
-                SURE_AGREEMENT if self.lost else MIN_AGREEMENT,
+                SURE_AGREEMENT if self.lost else FRAME_AGREEMENT,
             )
             if not wrong:
                 return found, ""
             problem = problem or wrong
         return None, problem
 
-    def _by_features(self, view: View) -> NDArray | None:
+    def _by_features(self, prepared: PreparedFrame) -> NDArray | None:
         reference = self.odometry.reference
-        guess = locate(view.features(), self.odometry.keyframes.items[reference].features)
-        return (
-            None if guess is None else self.odometry.keyframes.T_world_keyframe[reference] @ guess
-        )
+        keyframes = self.odometry.keyframes
+        guess = locate(prepared.features, keyframes.items[reference].features)
+        return None if guess is None else keyframes.T_world_keyframe[reference] @ guess
 
-    def _relocalise(self, view: View) -> tuple[int, Registration] | None:
-        """The keyframe that a lost view belongs to, and its alignment to it."""
+    def _relocalise(self, prepared: PreparedFrame) -> tuple[int, Registration] | None:
+        """The keyframe that shows the same place as a lost frame, and the alignment to it."""
         keyframes = self.odometry.keyframes
         for number in most_similar(
-            view.features(), [keyframe.features for keyframe in keyframes.items], CANDIDATES
+            prepared.features, [keyframe.features for keyframe in keyframes.items], CANDIDATES
         ):
-            guess = locate(view.features(), keyframes.items[number].features)
+            guess = locate(prepared.features, keyframes.items[number].features)
             if guess is None:
                 continue
             found = register(
-                view.pyramid, keyframes.pyramid(number), guess, self.settings.photometric_weight
+                prepared.pyramid, keyframes.pyramid(number), guess, self.settings.photometric_weight
             )
             if believable(found, guess):
                 return number, found
         return None
 
-    def _accept(self, view: View, found: Registration, verdict: Verdict) -> TrackedFrame:
+    def _accept(
+        self, prepared: PreparedFrame, found: Registration, verdict: Verdict
+    ) -> TrackedFrame:
         odometry = self.odometry
         T_world_camera = se3.normalized(
             odometry.keyframes.T_world_keyframe[odometry.reference] @ found.T_target_source
         )
         self.motion = np.eye(4) if self.lost else se3.inverse(self.T_world_camera) @ T_world_camera
         self.lost = False
-        tracked = odometry.place(view, verdict, found.T_target_source, found)
+        tracked = odometry.place(prepared, verdict, found.T_target_source, found)
         if odometry.is_far(found):
-            number = odometry.add_keyframe(view, T_world_camera, found)
+            number = odometry.add_keyframe(prepared, T_world_camera, found)
             odometry.link_keyframe(number, by_appearance=True)
             T_world_camera = odometry.keyframes.T_world_keyframe[number]
         self.T_world_camera = T_world_camera
