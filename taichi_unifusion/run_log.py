@@ -123,7 +123,7 @@ class RunLog:
             if not any(name in earlier.lacking for earlier in self.steps):
                 self.warn(f"{reason}; frames without it add to the other maps only")
         self.steps.append(replace(step, milliseconds={"load": 1e3 * waited, **step.milliseconds}))
-        self.poses.append((frame.timestamp, frame.T_world_camera))
+        self.poses.append((frame.timestamp, frame.require_pose()))
         self.check_poses(frame)
 
     def add_skipped(self, i: int, error: UniFusionError) -> None:

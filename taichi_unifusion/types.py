@@ -227,6 +227,12 @@ class Frame:
                 f"{self.depth.shape[1]}x{self.depth.shape[0]}; register or resize one of them"
             )
 
+    def require_pose(self) -> NDArray[np.float64]:
+        """T_world_camera; raises PoseError where there is none."""
+        if self.T_world_camera is None:
+            raise PoseError(f"{self.label}: there is no pose for this frame")
+        return self.T_world_camera
+
     def with_image(self, name: str, image: NDArray) -> Frame:
         """A copy that also carries the property image `name`, (H, W) or (H, W, c)."""
         image = np.ascontiguousarray(image, dtype=np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from taichi_unifusion import Frame, PinholeCamera, PointCloud
-from taichi_unifusion.errors import InputError
+from taichi_unifusion.errors import InputError, PoseError
 from taichi_unifusion.types import ImageView, Trajectory
 
 CAMERA = PinholeCamera(65, 48, 60.0, 61.0, 31.7, 24.2)
@@ -70,6 +70,13 @@ def test_frames_are_called_by_name_or_number():
     depth = np.ones((48, 65), np.float32)
     assert Frame(depth, CAMERA, index=7).label == "frame 7"
     assert Frame(depth, CAMERA, name="depth/7.png").label == "depth/7.png"
+
+
+def test_a_frame_without_a_pose_says_which_it_is():
+    depth = np.ones((48, 65), np.float32)
+    with pytest.raises(PoseError, match="depth/7.png: there is no pose"):
+        Frame(depth, CAMERA, name="depth/7.png").require_pose()
+    assert Frame(depth, CAMERA, T_world_camera=np.eye(4)).require_pose().shape == (4, 4)
 
 
 def test_numbers_stand_in_for_time_stamps_that_are_missing():

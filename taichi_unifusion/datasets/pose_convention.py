@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import PoseError
 from ..types import Frame
 
 GRID = 48  # points along each image axis
@@ -36,15 +35,9 @@ READINGS = {
 
 def has_moved(a: Frame, b: Frame) -> bool:
     """Whether the poses of two frames differ enough to tell readings apart."""
-    T_a_b = np.linalg.inv(_pose_of(a)) @ _pose_of(b)
+    T_a_b = np.linalg.inv(a.require_pose()) @ b.require_pose()
     angle = np.arccos(np.clip((np.trace(T_a_b[:3, :3]) - 1) / 2, -1, 1))
     return bool(np.linalg.norm(T_a_b[:3, 3]) > MIN_MOTION[0] or angle > MIN_MOTION[1])
-
-
-def _pose_of(frame: Frame) -> NDArray[np.float64]:
-    if frame.T_world_camera is None:
-        raise PoseError(f"{frame.label}: has no pose to judge")
-    return frame.T_world_camera
 
 
 def agreement(a: Frame, b: Frame, T_b_a: NDArray[np.float64]) -> tuple[float, int]:
@@ -68,7 +61,7 @@ def guess_pose_convention(a: Frame, b: Frame) -> tuple[bool, str | None]:
     """Whether this pair of frames decides it, and a sentence if another reading of the poses fits
     far better.
     """
-    T_world_a, T_world_b = _pose_of(a), _pose_of(b)
+    T_world_a, T_world_b = a.require_pose(), b.require_pose()
     given, seen_as_given = agreement(a, b, np.linalg.inv(T_world_b) @ T_world_a)
     scores = {}
     for reading, read in READINGS.items():

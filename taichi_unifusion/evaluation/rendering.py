@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, PoseError
+from ..errors import InputError
 from ..rendering.raycaster import RayCaster
 from ..types import Frame, Mesh
 
@@ -102,9 +102,7 @@ def evaluate_rendering(
 
 def render_frame(caster: RayCaster, frame: Frame, color: ColorAt | None = None) -> RenderedFrame:
     """What the camera of `frame` would see of the caster's mesh; colour as in `evaluate_rendering`."""
-    if frame.T_world_camera is None:
-        raise PoseError(f"{frame.label}: there is no pose for this frame")
-    hits = caster.cast(frame.camera, frame.T_world_camera)
+    hits = caster.cast(frame.camera, frame.require_pose())
     vertex_colors = caster.mesh.attributes.get("color")
     if color is None and vertex_colors is None:
         return RenderedFrame(hits.depth, None)

@@ -114,12 +114,12 @@ class TrackingResult:
         """Of the frames that have a pose; frame numbers stand in for time stamps where a recording
         has none.
         """
-        posed = [
-            (frame.timestamp, frame.index, frame.T_world_camera)
-            for frame in self.frames
-            if frame.T_world_camera is not None
-        ]
-        return Trajectory.of(*([row[k] for row in posed] for k in range(3)))
+        posed = [(frame, T) for frame in self.frames if (T := frame.T_world_camera) is not None]
+        return Trajectory.of(
+            [frame.timestamp for frame, _ in posed],
+            [frame.index for frame, _ in posed],
+            [T for _, T in posed],
+        )
 
 
 @dataclass(frozen=True)

@@ -174,7 +174,8 @@ def test_P7_a_stamp_that_appears_again_is_left_out_and_said(tmp_path):
     assert len(dataset) == 3
     np.testing.assert_array_equal(dataset[1].depth, samples[1].metres(5000.0))
     assert any(
-        "depth.txt, line 5" in warning and "appears again" in warning for warning in dataset.warnings
+        "depth.txt, line 5" in warning and "appears again" in warning
+        for warning in dataset.warnings
     )
 
 
