@@ -15,17 +15,23 @@ camera is the world, and other frames have no pose.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DatasetError, FrameError, MissingDependency, check_choice
-from ..files.images import decode_color, depth_to_metres
+from ..errors import DatasetError, check_choice
+from ..files.images import depth_to_metres
+from ..files.k4a_container import (
+    CALIBRATION,
+    COLOR,
+    DEPTH,
+    INFRARED,
+    read_contents,
+    read_images,
+)
 from ..files.trajectories import Pose, read_stamped_poses
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..types import Frame, PinholeCamera
@@ -35,9 +41,7 @@ from .k4a_calibration import read_calibration
 from .lens_camera import LensCamera, color_for_depth, splat_depth
 
 DEPTH_SCALE = 1000.0
-TRACKS = ("DEPTH", "COLOR", "IR")  # titles
 MAX_DIFFERENCE = 0.02  # [s] between a pose and a depth image
-CALIBRATION = "calibration.json"
 FINER = 1.5  # readings a pixel of the colour camera that keep depth free of holes there
 
 
@@ -66,34 +70,27 @@ class Capture:
     color: int | None
     infrared: int | None
 
+    @property
+    def stamps(self) -> dict[str, int]:
+        """Title of the track -> time stamp, of the images that are there."""
+        stamps = {DEPTH: self.depth, COLOR: self.color, INFRARED: self.infrared}
+        return {title: stamp for title, stamp in stamps.items() if stamp is not None}
+
 
 class K4aFile(Dataset):
     """The frames of an Azure Kinect recording, each read when asked for."""
 
     def __init__(self, path: Path, align: str, depth_scale: float, max_difference: float) -> None:
         self.name, self.path, self.align, self.depth_scale = f"k4a {path}", path, align, depth_scale
-        with _opened(path) as container:
-            streams = _tracks(container, path)
-            self.sizes = {title: (stream.width, stream.height) for title, stream in streams.items()}
-            attached = next(
-                (s.data for s in container.streams.attachments if s.name == CALIBRATION), None
-            )
-            if attached is None:
-                raise DatasetError(
-                    f"{path}: no {CALIBRATION} is attached; was the recording converted by another program?"
-                )
-            self.calibration = read_calibration(
-                attached, f"{path}: {CALIBRATION}", self.sizes["DEPTH"], self.sizes.get("COLOR")
-            )
-            # [s] of a time stamp; a Matroska file has one for all tracks
-            self.unit = float(streams["DEPTH"].time_base)
-            stamps = {title: [] for title in streams}
-            for packet in container.demux(*streams.values()):
-                if packet.pts is not None:
-                    stamps[_title(packet.stream)].append(packet.pts)
-        self.captures = _captures(
-            {title: np.array(sorted(values)) for title, values in stamps.items()}
+        contents = read_contents(path)
+        self.calibration = read_calibration(
+            contents.calibration,
+            f"{path}: {CALIBRATION}",
+            contents.sizes[DEPTH],
+            contents.sizes.get(COLOR),
         )
+        self.sizes, self.unit = contents.sizes, contents.unit
+        self.captures = _captures(contents.stamps)
         if not self.captures:
             raise DatasetError(f"{path}: holds no depth image")
         if align == "color" and self.calibration.color is None:
@@ -136,18 +133,20 @@ class K4aFile(Dataset):
         T_world_camera = (
             None if pose.T_world_camera is None and not pose.problem else pose.checked()
         )
-        images = self._read(capture, where)
-        raw = images["DEPTH"]
+        images = read_images(self.path, capture.stamps, where)
+        raw = images[DEPTH]
         depth = depth_to_metres(raw, f"{where} depth", self.depth_scale, ())
         infrared = (
-            images["IR"].astype(np.float32) if "IR" in images else np.zeros(raw.shape, np.float32)
+            images[INFRARED].astype(np.float32)
+            if INFRARED in images
+            else np.zeros(raw.shape, np.float32)
         )
         register = self._to_color if self.align == "color" else self._to_depth
-        depth, color, infrared = register(depth, images.get("COLOR"), infrared)
+        depth, color, infrared = register(depth, images.get(COLOR), infrared)
         frame = Frame(
             depth, self.camera, color, T_world_camera, index, capture.depth * self.unit, where
         )
-        return frame.with_image("infrared", infrared) if "IR" in images else frame
+        return frame.with_image("infrared", infrared) if INFRARED in images else frame
 
     def _to_depth(
         self, depth: NDArray, color: NDArray | None, infrared: NDArray
@@ -179,57 +178,15 @@ class K4aFile(Dataset):
         depth[~lens.sees(camera)] = 0
         return depth, None if color is None else lens.undistort(color, camera), infrared
 
-    def _read(self, capture: Capture, where: str) -> dict[str, NDArray]:
-        """The images of a frame by title of their track, as they are in the file."""
-        wanted = {"DEPTH": capture.depth, "COLOR": capture.color, "IR": capture.infrared}
-        wanted = {title: stamp for title, stamp in wanted.items() if stamp is not None}
-        images: dict[str, NDArray] = {}
-        with _opened(self.path) as container:
-            streams = _tracks(container, self.path)
-            container.seek(min(wanted.values()), stream=streams["DEPTH"], backward=True)
-            for packet in container.demux(*(streams[title] for title in wanted)):
-                title = _title(packet.stream)
-                if packet.pts == wanted[title]:
-                    images[title] = _decode(packet, title, f"{where} {title.lower()}")
-                if len(images) == len(wanted) or packet.pts is None:
-                    break
-        for title in wanted:
-            if title not in images:
-                raise FrameError(
-                    f"{where}: its {title.lower()} image cannot be read; the recording is damaged there"
-                )
-        return images
-
-
-def _decode(packet, title: str, where: str) -> NDArray:
-    """The image in a packet: (H, W) uint16, or (H, W, 3) RGB for the colour track."""
-    stream = packet.stream
-    if title != "COLOR":  # 16-bit big-endian, whatever the machine
-        if packet.size != 2 * stream.width * stream.height:
-            raise FrameError(
-                f"{where}: holds {packet.size} bytes, not those of {stream.width}x{stream.height} 16-bit pixels"
-            )
-        return (
-            np.frombuffer(bytes(packet), ">u2")
-            .reshape(stream.height, stream.width)
-            .astype(np.uint16)
-        )
-    if stream.codec_context.name == "mjpeg":
-        return decode_color(bytes(packet), where)
-    frames = packet.decode()
-    if not frames:
-        raise FrameError(f"{where}: cannot be decoded")
-    return frames[0].to_ndarray(format="rgb24")
-
 
 def _captures(stamps: dict[str, NDArray[np.int64]]) -> list[Capture]:
     """A frame for every depth image, with the colour and infrared images that belong to it: within
     half a period.
     """
-    depth = stamps["DEPTH"]
+    depth = stamps[DEPTH]
     half = np.median(np.diff(depth)) / 2 if len(depth) > 1 else np.inf
     found: dict[str, list[int | None]] = {}
-    for title in ("COLOR", "IR"):
+    for title in (COLOR, INFRARED):
         of = stamps.get(title, np.empty(0, np.int64))
         near = (
             of[nearest(of, depth)]
@@ -242,7 +199,7 @@ def _captures(stamps: dict[str, NDArray[np.int64]]) -> list[Capture]:
         ]
     return [
         Capture(int(at), color, infrared)
-        for at, color, infrared in zip(depth, found["COLOR"], found["IR"], strict=True)
+        for at, color, infrared in zip(depth, found[COLOR], found[INFRARED], strict=True)
     ]
 
 
@@ -263,48 +220,3 @@ def _read_poses(file: Path, times: NDArray[np.float64], max_difference: float) -
         else Pose(str(file), problem=nothing)
         for i, time in zip(nearest(stamps, times), times, strict=True)
     ]
-
-
-def _title(stream) -> str:
-    return stream.metadata.get("title", "").upper()
-
-
-def _tracks(container, path: Path) -> dict:
-    """Title -> video stream of the tracks that are there; depth must be."""
-    streams = {
-        _title(stream): stream for stream in container.streams.video if _title(stream) in TRACKS
-    }
-    if "DEPTH" not in streams:
-        raise DatasetError(
-            f"{path}: has no track DEPTH, only {', '.join(map(_title, container.streams.video)) or 'no video'}; "
-            "is this a recording of an Azure Kinect?"
-        )
-    for title in ("DEPTH", "IR"):
-        if title in streams and streams[title].codec_context.pix_fmt != "gray16be":
-            raise DatasetError(
-                f"{path}: track {title} is {streams[title].codec_context.pix_fmt}, not 16-bit big-endian"
-            )
-    return streams
-
-
-@contextmanager
-def _opened(path: Path):
-    """The file as a PyAV container; what PyAV cannot read becomes a DatasetError."""
-    av = _import_av()
-    try:
-        with av.open(str(path)) as container:
-            yield container
-    except av.error.FFmpegError as error:
-        raise DatasetError(
-            f"{path}: not a readable Matroska recording ({error.strerror})"
-        ) from error
-
-
-def _import_av() -> ModuleType:
-    try:
-        import av
-    except ImportError:
-        raise MissingDependency(
-            "recordings of an Azure Kinect are read with PyAV: pip install 'taichi-unifusion[k4a]'"
-        ) from None
-    return av
