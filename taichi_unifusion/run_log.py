@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .datasets.checks import guess_depth_scale
 from .datasets.loading import index_in_recording, recording_of
+from .datasets.plausibility import guess_depth_scale
 from .datasets.pose_convention import guess_pose_convention, has_moved
 from .errors import DatasetError, FrameError, OutOfRange, PoseError, SizeMismatch, UniFusionError
 from .maps import Integration

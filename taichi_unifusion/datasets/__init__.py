@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from ..errors import DatasetError, InputError, convert, did_you_mean, is_convertible
-from .base import Dataset, DatasetView
+from .dataset import Dataset, DatasetView
 
 FORMATS = {  # name -> module here, what opens a recording
     "synthetic": ("synthetic", "SyntheticRoom"),

@@ -12,7 +12,7 @@ from ..errors import DatasetError, FileError, InputError, convert, did_you_mean
 from ..files.images import INVALID_DEPTH
 from ..files.strict_yaml import read_yaml
 from ..types import PinholeCamera
-from .intrinsics import make_camera
+from .depth_camera import make_camera
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from ..files.trajectories import REPLICA, TUM, Pose, PoseRow, read_pose_file, re
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..types import PinholeCamera
 from .camera_yaml import CameraFile, read_camera_yaml
-from .intrinsics import check_size
-from .recording import FrameFiles, Recording, depth_size
+from .depth_camera import check_size
+from .file_recording import FrameFiles, Recording, depth_size
 
 DEPTH_SUFFIXES, COLOR_SUFFIXES, INFRARED_SUFFIXES = (
     (".png", ".npy"),

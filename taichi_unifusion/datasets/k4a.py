@@ -35,10 +35,10 @@ from ..files.k4a_container import (
 from ..files.trajectories import Pose, read_stamped_poses
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..types import Frame, PinholeCamera
-from .base import Dataset
-from .checks import pose_warnings
+from .dataset import Dataset
+from .depth_registration import LensCamera, color_for_depth, splat_depth
 from .k4a_calibration import read_calibration
-from .lens_camera import LensCamera, color_for_depth, splat_depth
+from .plausibility import pose_warnings
 
 DEPTH_SCALE = 1000.0
 MAX_DIFFERENCE = 0.02  # [s] between a pose and a depth image

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ..errors import DatasetError, PoseError
 from ..types import check_rigid
-from .intrinsics import make_camera
-from .lens_camera import MAX_RADIUS, LensCamera
+from .depth_camera import make_camera
+from .depth_registration import MAX_RADIUS, LensCamera
 
 DEPTH_MODES = {  # (width, height) of depth images -> size of the binned sensor, first column and row that are kept
     (320, 288): ((512, 512), (96, 90)),  # NFOV 2x2 binned

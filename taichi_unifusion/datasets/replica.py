@@ -19,8 +19,8 @@ from ..files.atomic import read_bytes
 from ..files.frame_files import file_of, first_existing, numbered_files
 from ..files.trajectories import REPLICA, Pose, read_pose_rows
 from ..types import PinholeCamera
-from .intrinsics import check_size, make_camera
-from .recording import FrameFiles, Recording, check_depth_scale, depth_size
+from .depth_camera import check_size, make_camera
+from .file_recording import FrameFiles, Recording, check_depth_scale, depth_size
 
 DEPTH_SCALE = 6553.5
 DEFAULT_CAMERA = PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)

@@ -19,8 +19,8 @@ from ..files.frame_files import file_of, first_existing, list_names, numbered_fi
 from ..files.text_rows import parse_numbers, read_lines
 from ..files.trajectories import read_pose_file
 from ..types import PinholeCamera
-from .intrinsics import check_size, make_camera, read_matrix_camera
-from .recording import FrameFiles, Recording, check_depth_scale, depth_size
+from .depth_camera import check_size, make_camera, read_matrix_camera
+from .file_recording import FrameFiles, Recording, check_depth_scale, depth_size
 from .sens import SensFile
 from .seven_scenes import flat_frames, no_flat_poses
 

@@ -15,7 +15,7 @@ from ..errors import DatasetError, InputError
 from ..files.trajectories import read_trajectory
 from ..rendering.textured_scene import SceneImages, TexturedScene, load_scene
 from ..types import Frame, Mesh, PinholeCamera, Trajectory
-from .base import Dataset
+from .dataset import Dataset
 from .synthetic import FOCAL_PER_WIDTH
 
 

@@ -12,10 +12,10 @@ from ..files.images import INVALID_DEPTH, depth_to_metres, resize_color
 from ..files.sens_container import decode_sens_color, decode_sens_depth, open_sens, read_images
 from ..files.trajectories import Pose
 from ..types import Frame, PinholeCamera
-from .base import Dataset
-from .checks import camera_warnings, pose_warnings
-from .intrinsics import check_size, make_camera
-from .recording import check_depth_scale
+from .dataset import Dataset
+from .depth_camera import check_size, make_camera
+from .file_recording import check_depth_scale
+from .plausibility import camera_warnings, pose_warnings
 
 
 class SensFile(Dataset):

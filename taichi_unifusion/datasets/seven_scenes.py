@@ -16,8 +16,8 @@ from ..errors import DatasetError
 from ..files.frame_files import file_of, first_existing, list_names, numbered_files
 from ..files.trajectories import read_pose_file
 from ..types import PinholeCamera
-from .intrinsics import check_size, make_camera, read_matrix_camera
-from .recording import FrameFiles, Recording, depth_size
+from .depth_camera import check_size, make_camera, read_matrix_camera
+from .file_recording import FrameFiles, Recording, depth_size
 
 DEPTH_SCALE = 1000.0
 DEFAULT_SIZE, DEFAULT_INTRINSICS = (640, 480), (585.0, 585.0, 320.0, 240.0)  # fx fy cx cy

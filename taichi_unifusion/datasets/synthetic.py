@@ -23,7 +23,7 @@ from ..rendering.primitives import Primitive, tessellate
 from ..rendering.room import MATERIALS, ROOM_SIZE, furnished_room
 from ..runtime import current
 from ..types import Frame, Mesh, PinholeCamera
-from .base import Dataset
+from .dataset import Dataset
 
 FOCAL_PER_WIDTH = 575.0 / 640.0  # Kinect v1's depth camera
 FRAME_RATE = 30.0  # [Hz]

@@ -25,8 +25,8 @@ from ..files.text_rows import finite_or_none, read_lines
 from ..files.trajectories import Pose, read_stamped_poses
 from ..geometry.time_stamps import associate, check_max_difference, nearest
 from ..types import PinholeCamera
-from .intrinsics import check_size
-from .recording import FrameFiles, Recording, depth_size
+from .depth_camera import check_size
+from .file_recording import FrameFiles, Recording, depth_size
 
 DEPTH_SCALE = 5000.0
 MAX_DIFFERENCE = 0.02  # [s], the benchmark's

@@ -22,7 +22,7 @@ from dataset_writers import (
 )
 
 from taichi_unifusion.datasets import open_dataset
-from taichi_unifusion.datasets.checks import guess_depth_scale
+from taichi_unifusion.datasets.plausibility import guess_depth_scale
 from taichi_unifusion.errors import FrameError, InputError, SizeMismatch
 from taichi_unifusion.files.images import depth_file_size, read_color, read_depth
 

@@ -27,8 +27,8 @@ from ..files.images import (
 )
 from ..files.trajectories import Pose
 from ..types import Frame, PinholeCamera
-from .base import Dataset
-from .checks import camera_warnings, pose_warnings
+from .dataset import Dataset
+from .plausibility import camera_warnings, pose_warnings
 
 SIZE_SAMPLES = 5  # depth headers read to learn the size, so that one odd file does not decide it
 

@@ -1,4 +1,4 @@
-"""Intrinsics from text files, with the file named in every error."""
+"""The camera of depth images: from intrinsics in text files, checked against the images."""
 
 from __future__ import annotations
 
