@@ -46,10 +46,10 @@ def segment(options: Segment) -> int:
     """Names -> labelled mesh, picture, scores."""
     names = read_labels_file(options.labels)
     from ..files.atomic import check_writable, write_text
+    from ..files.images import write_png
     from ..files.meshes import write_mesh
     from ..language.pictures import label_colors, label_mesh, segmentation_picture
     from ..language.questions import segment as segment_points
-    from ..rendering.preview import write_png
     from ..results.folder_writer import FolderWriter
     from ..results.run_folder import RunFolder
 

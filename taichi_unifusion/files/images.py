@@ -1,5 +1,5 @@
-"""Colour and depth image files -> RGB bytes and metres; every failure is a FrameError that names
-the file.
+"""Colour and depth image files -> RGB bytes and metres; every failure to read one is a FrameError
+that names the file. Pictures are written as PNG.
 
 Files are read unchanged and their type checked: with OpenCV's default flag a 16-bit depth image
 becomes 8-bit silently.
@@ -7,6 +7,7 @@ becomes 8-bit silently.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FrameError, SizeMismatch
+from .atomic import atomic_write
 from .image_headers import MAX_PIXELS, check_whole, read_header
 
 INVALID_DEPTH = (0, 65535)  # no reading; 65535 is also what 16 bits saturate at
@@ -156,6 +158,13 @@ def resize_image(
         (width, height),
         interpolation=cv2.INTER_AREA if width < image_width else cv2.INTER_LINEAR,
     )
+
+
+def write_png(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
+    """Write an RGB picture (H, W, 3) atomically; raises FileError where that fails."""
+    content = cv2.imencode(".png", image[..., ::-1])[1]
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content.tobytes())
 
 
 def _read_bytes(path: Path, count: int = -1) -> bytes:

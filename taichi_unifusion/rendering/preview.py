@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, check_choice
-from ..files.atomic import atomic_write
+from ..files.images import write_png
 from ..geometry.triangles import area_vectors, vertex_normals
 from ..types import Mesh, PinholeCamera, Trajectory, check_rigid
 from .depth_buffer import DepthBuffer, draw_depth_buffer
@@ -185,15 +185,6 @@ def _depth_buffer(
     return draw_depth_buffer(
         drawable.vertices, drawable.faces, camera, T_world_camera, near, two_sided=False
     )
-
-
-def write_png(path: str | os.PathLike, image: NDArray[np.uint8]) -> None:
-    """Write an RGB picture (H, W, 3) atomically; raises FileError where that fails."""
-    import cv2
-
-    content = cv2.imencode(".png", image[..., ::-1])[1]
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(content.tobytes())
 
 
 # Where to look from

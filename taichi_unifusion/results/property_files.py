@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FileError, InputError
+from ..files.images import write_png
 from ..rendering.legend import draw_legend, property_mesh
 from ..rendering.look import Look, shown_range
-from ..rendering.preview import draw_preview, write_png
+from ..rendering.preview import draw_preview
 from ..types import Mesh, Trajectory
 from .record import PropertyRecord, read_record
 from .run_folder import RunFolder
