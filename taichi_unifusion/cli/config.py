@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from ..config import Config, dump_config
+from .options import OPTIONAL, Settings
 from .terminal import DONE
 
 
@@ -20,9 +21,9 @@ class ShowConfig:
     hold only what differs.
     """
 
-    config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = None
+    config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
     """YAML file of settings that differ from the defaults."""
-    settings: Annotated[Config, arg(name="")] = field(default_factory=Config)
+    settings: Settings = field(default_factory=Config)
 
 
 def show_config(options: ShowConfig) -> int:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ..datasets import Dataset, open_dataset
-from ..errors import DatasetError, FrameError, InputError
+from ..errors import FrameError, InputError
 from ..results.tables import format_table
-from .recording import FORMAT_DEFAULT
-from .scores import ScoreOptions, cell, percent
+from .options import FORMAT_DEFAULT, ONE_EACH, Device, ScoreOptions, frames_asked, merged_options
+from .scores import cell, check_out, percent, show
 from .terminal import frame_progress
 
 if TYPE_CHECKING:
@@ -29,14 +29,15 @@ RUN_DEFAULT, CHOICE_DEFAULT = "(default: the run's recording)", "(default: the r
 
 
 @dataclass(frozen=True)
-class EvaluateRendering(ScoreOptions):
+class EvaluateRendering:
     """Compare depth and colour, rendered at the frames' poses, with the frames: depth L1, coverage,
     PSNR, SSIM.
 
     Example: unifusion evaluate rendering results/kitchen
 
-    Of a results folder, with frames that its run did not use: those half-way between the ones that it did. --start, --end and
-    --every choose others between its first and its last, or beyond. Colour is decoded from its colour map at the points hit.
+    Of a results folder, with frames that its run did not use: those half-way between the ones that
+    it did. --start, --end and --every choose others between its first and its last, or beyond.
+    Colour is decoded from its colour map at the points hit.
     """
 
     reconstruction: Annotated[Positional[Path], arg(metavar="RESULTS|MESH")]
@@ -70,15 +71,20 @@ class EvaluateRendering(ScoreOptions):
     """Farthest reading to compare with, in metres."""
     depth_scale: Annotated[float | None, arg(metavar="S", help_behavior_hint=FORMAT_DEFAULT)] = None
     """Units of the depth images that make a metre."""
+    option: Annotated[
+        UseAppendAction[tuple[str, ...]], arg(metavar="KEY=VALUE", help_behavior_hint=ONE_EACH)
+    ] = ()
+    """Another option of the recording's format, as of `unifusion reconstruct`."""
     vertex_colors: FlagCreatePairsOff[bool] = False
     """Judge the colours of the mesh's vertices instead of the colour map."""
-    device: Literal["auto", "cuda", "cpu"] = "auto"
+    device: Device = "auto"
     """Where to compute."""
+    scores: Annotated[ScoreOptions, arg(name="")] = field(default_factory=ScoreOptions)
 
 
 def evaluate_rendering(options: EvaluateRendering) -> int:
     """Mesh, map, frames -> table."""
-    options.check_out()
+    check_out(options.scores)
     import numpy as np
 
     from .. import runtime
@@ -91,7 +97,7 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     run = find_run(options.reconstruction)
     mesh = run.mesh() if run else read_any_mesh(options.reconstruction)
     recording, run = _recording(options, run)
-    chosen = choose_frames(options, run, len(recording), recording.name)
+    chosen = choose_frames(options, run, recording)
     limits = run.config().preprocess if run else Config().preprocess
     runtime.init(options.device)
     color, T_run_recording = (
@@ -140,7 +146,8 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
         "used_by_the_run": sorted(used),
         "colour": "map" if color else "vertices",
     }
-    return options.show(
+    return show(
+        options.scores,
         about,
         result,
         format_table(rows),
@@ -151,45 +158,32 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
 def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Run | None]:
     """The recording to compare with, and the run as if it were made from it."""
     given = {} if options.depth_scale is None else {"depth_scale": options.depth_scale}
-    if run is None:
-        if options.format is None:
-            raise InputError(
-                "rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT "
-                "PATH"
-            )
-        return open_dataset(options.format, options.path, **given), None
-    if options.format is None:
-        source = replace(run.source, reading={**run.source.reading, **given})
-    else:
-        known = run.source.reading if run.source.format == options.format else {}
-        source = replace(
-            run.source,
-            format=options.format,
-            path=str(options.path or ""),
-            reading={**known, **given},
+    format = options.format or (run.source.format if run else None)
+    if format is None:
+        raise InputError(
+            "rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT "
+            "PATH"
         )
-    run = replace(run, source=source)
+    given = merged_options(format, given, options.option)
+    if run is None:
+        return open_dataset(format, options.path, **given), None
+    known = run.source.reading if run.source.format == format else {}
+    path = run.source.path if options.format is None else str(options.path or "")
+    run = replace(
+        run, source=replace(run.source, format=format, path=path, reading={**known, **given})
+    )
     return run.recording, run
 
 
-def choose_frames(
-    options: EvaluateRendering, run: Run | None, count: int, name: str
-) -> Sequence[int]:
-    """The frames to compare with, of `count` in the recording: held-out ones, unless `options.all`."""
+def choose_frames(options: EvaluateRendering, run: Run | None, recording: Dataset) -> Sequence[int]:
+    """The frames of the recording to compare with: held-out ones, unless `options.all`."""
     start, end, every = options.start, options.end, options.every
     if run is not None and (start, end, every) == (None, None, None):
         every = run.source.every
         start = run.source.start + (0 if options.all else every // 2)
     start = (run.source.start if run else 0) if start is None else start
     end = run.source.asked.stop if end is None and run and start < run.source.asked.stop else end
-    every = 1 if every is None else every
-    if start < 0 or every < 1 or (end is not None and end <= start):
-        raise InputError(
-            f"frames: need 0 <= start < end and every >= 1, got start {start}, end {end}, every {every}"
-        )
-    asked = range(count)[start:end:every]
-    if not asked:
-        raise DatasetError(f"{name}: there is no frame {start}, it has {count} (0 is the first)")
+    asked = frames_asked(recording, start, end, 1 if every is None else every)
     held_out = asked if run is None or options.all else [i for i in asked if i not in set(run.used)]
     if not held_out:
         raise InputError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +12,8 @@ from tyro.conf import Positional, arg
 
 from ..errors import InputError
 from ..results.tables import format_table
-from .scores import ScoreOptions, percent
+from .options import ScoreOptions
+from .scores import check_out, percent, show
 
 if TYPE_CHECKING:
     from ..files.labels import LabelFile
@@ -21,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class EvaluateSegmentation(ScoreOptions):
+class EvaluateSegmentation:
     """Compare predicted labels of points with true ones: IoU and accuracy of every class, of seen
     and unseen ones.
 
@@ -46,11 +47,12 @@ class EvaluateSegmentation(ScoreOptions):
     """Vertex property of a .ply that holds the labels."""
     max_distance: Annotated[float, arg(metavar="M")] = 0.1
     """How far, in metres, a label is carried from one .ply to the other."""
+    scores: Annotated[ScoreOptions, arg(name="")] = field(default_factory=ScoreOptions)
 
 
 def evaluate_segmentation(options: EvaluateSegmentation) -> int:
     """Labels -> table."""
-    options.check_out()
+    check_out(options.scores)
     from ..evaluation.segmentation import evaluate_segmentation as evaluate
     from ..files.labels import read_class_names, read_labels
 
@@ -90,15 +92,15 @@ def evaluate_segmentation(options: EvaluateSegmentation) -> int:
         if group
     ]
     notes = (
-        f"{percent(result.overall_accuracy)} % of {result.points:,} points are right; {result.unlabelled:,} of them have "
-        f"no predicted label, {result.ignored:,} more were left out."
+        f"{percent(result.overall_accuracy)} % of {result.points:,} points are right; "
+        f"{result.unlabelled:,} of them have no predicted label, {result.ignored:,} more were left out."
     )
     about = {
         "metric": "segmentation",
         "predicted": options.predicted,
         "ground_truth": options.ground_truth,
     }
-    return options.show(about, result, format_table(rows), format_table(means), notes)
+    return show(options.scores, about, result, format_table(rows), format_table(means), notes)
 
 
 def _on_true_points(predicted: LabelFile, truth: LabelFile, max_distance: float):

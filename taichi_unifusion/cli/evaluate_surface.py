@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,7 +10,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..errors import InputError
 from ..results.tables import format_table
-from .scores import ScoreOptions, cell, percent
+from .options import Device, ScoreOptions
+from .scores import cell, check_out, percent, show
 
 if TYPE_CHECKING:
     from ..results.reader import Run
@@ -20,7 +21,7 @@ NO_TRUTH = "surface: give the true mesh too: unifusion evaluate surface MESH TRU
 
 
 @dataclass(frozen=True)
-class EvaluateSurface(ScoreOptions):
+class EvaluateSurface:
     """Compare a reconstructed surface with the true one: accuracy, completeness, F1, Chamfer
     distance.
 
@@ -55,15 +56,16 @@ class EvaluateSurface(ScoreOptions):
     """Measure to the other mesh's surface, or, as published, to its samples: too coarse where these
     lie far apart.
     """
-    device: Literal["auto", "cuda", "cpu"] = "auto"
+    device: Device = "auto"
     """Where to compute."""
+    scores: Annotated[ScoreOptions, arg(name="")] = field(default_factory=ScoreOptions)
 
 
 def evaluate_surface(options: EvaluateSurface) -> int:
     """Meshes -> table."""
     if options.whole and options.seen_by:
         raise InputError("surface: --whole and --seen-by exclude each other")
-    options.check_out()
+    check_out(options.scores)
     from .. import runtime
     from ..evaluation.surface import evaluate_surface as evaluate
     from ..files.mesh_reading import read_any_mesh
@@ -120,7 +122,7 @@ def evaluate_surface(options: EvaluateSurface) -> int:
         "samples": options.samples,
         "seed": options.seed,
     }
-    return options.show(about, result, format_table(shares), format_table(means), judged)
+    return show(options.scores, about, result, format_table(shares), format_table(means), judged)
 
 
 def _own_truth(run: Run | None) -> Mesh:
@@ -128,9 +130,10 @@ def _own_truth(run: Run | None) -> Mesh:
     if run is None:
         raise InputError(NO_TRUTH)
     recording = run.recording
-    if not hasattr(recording, "ground_truth_mesh"):
+    ground_truth_mesh = getattr(recording, "ground_truth_mesh", None)
+    if ground_truth_mesh is None:
         raise InputError(
             f"surface: a recording of format '{run.source.format}' holds no true surface; give one: "
             "unifusion evaluate surface RESULTS TRUTH"
         )
-    return recording.ground_truth_mesh()
+    return ground_truth_mesh()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,14 +10,15 @@ from tyro.conf import Positional, arg
 
 from ..errors import InputError
 from ..results.tables import format_table
-from .scores import ScoreOptions, cell
+from .options import ScoreOptions
+from .scores import cell, check_out, show
 
 if TYPE_CHECKING:
     from ..types import Trajectory
 
 
 @dataclass(frozen=True)
-class EvaluateTrajectory(ScoreOptions):
+class EvaluateTrajectory:
     """Compare estimated camera poses with true ones: ATE after alignment, RPE.
 
     Example: unifusion evaluate trajectory results/desk rgbd_dataset_freiburg1_desk/groundtruth.txt
@@ -41,11 +42,12 @@ class EvaluateTrajectory(ScoreOptions):
     """Length of the motions whose error is RPE."""
     rpe_unit: Literal["frames", "metres"] = "frames"
     """What that length counts: matched poses, or metres of the true path."""
+    scores: Annotated[ScoreOptions, arg(name="")] = field(default_factory=ScoreOptions)
 
 
 def evaluate_trajectory(options: EvaluateTrajectory) -> int:
     """Poses -> table."""
-    options.check_out()
+    check_out(options.scores)
     from ..evaluation.trajectory import evaluate_trajectory as evaluate
 
     estimate, truth = _read(options)
@@ -73,7 +75,10 @@ def evaluate_trajectory(options: EvaluateTrajectory) -> int:
                 *(cell(getattr(errors, column) if errors else None, 3) for column in rows[0][1:]),
             ]
         )
-    notes = f"{result.matches} of {result.estimated_poses} estimated poses were matched with {result.true_poses} true ones."
+    notes = (
+        f"{result.matches} of {result.estimated_poses} estimated poses were matched with "
+        f"{result.true_poses} true ones."
+    )
     if result.scale is not None:
         notes += f" Scale: {result.scale:.4f}."
     if not result.unique:
@@ -83,7 +88,7 @@ def evaluate_trajectory(options: EvaluateTrajectory) -> int:
         "estimate": options.estimate,
         "ground_truth": options.ground_truth or "the recording's",
     }
-    return options.show(about, result, format_table(rows), notes)
+    return show(options.scores, about, result, format_table(rows), notes)
 
 
 def _read(options: EvaluateTrajectory) -> tuple[Trajectory, Trajectory]:

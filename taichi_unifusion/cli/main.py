@@ -14,10 +14,13 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
-from typing import Annotated, Union
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any
 
 import tyro
 from tyro.conf import subcommand
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from ..config import Config, load_config
 from ..errors import FileError, UniFusionError
@@ -41,7 +44,9 @@ DESCRIPTION = (
 )
 
 # options and function, or a group: its help, its commands
-COMMANDS: dict[str, tuple[type, Callable[..., int] | dict]] = {
+Commands = dict[str, tuple[type, Callable[..., int] | dict[str, Any]]]
+
+COMMANDS: Commands = {
     "reconstruct": (Reconstruct, reconstruct),
     "transfer": (Transfer, transfer),
     "understand": (Understand, understand),
@@ -79,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return report([error])
         except (
             OSError
-        ) as error:  # our own files are FileErrors; this is standard output, on a full disk
+        ) as error:  # our own files raise FileError; this is standard output, on a full disk
             if debug:
                 raise
             return report([FileError(f"output could not be written: {error.strerror or error}")])
@@ -94,37 +99,42 @@ def _dispatch(argv: list[str]) -> int:
     return _run("unifusion", DESCRIPTION, COMMANDS, argv)
 
 
-def _run(prog: str, description: str, commands: dict, argv: list[str]) -> int:
+def _run(prog: str, description: str, commands: Commands, argv: list[str]) -> int:
     name, arguments = (argv[0], argv[1:]) if argv and argv[0] in commands else (None, argv)
     if name is None:  # help, or no such command: tyro says it
-        every = Union[
-            tuple(
-                Annotated[
-                    _short(options), subcommand(name, description=options.__doc__.splitlines()[0])
-                ]
-                for name, (options, _) in commands.items()
-            )
-        ]
-        tyro.cli(every, prog=prog, description=description, args=arguments)
+        _say_commands(prog, description, commands, arguments)
         return FAILED
     options, command = commands[name]
     if isinstance(command, dict):
-        return _run(f"{prog} {name}", inspect.cleandoc(options.__doc__), command, arguments)
+        return _run(f"{prog} {name}", inspect.getdoc(options) or "", command, arguments)
     return command(_parse(f"{prog} {name}", options, arguments))
 
 
-def _parse(prog: str, options: type, arguments: list[str]):
+def _say_commands(prog: str, description: str, commands: Commands, arguments: list[str]) -> None:
+    kinds = (
+        Annotated[
+            options, subcommand(name, description=(inspect.getdoc(options) or "").splitlines()[0])
+        ]
+        for name, (options, _) in commands.items()
+    )
+    with _settings_left_out():
+        every: Any = reduce(or_, kinds)
+        tyro.cli(every, prog=prog, description=description, args=arguments)
+
+
+def _parse(prog: str, options: type, arguments: list[str]) -> Any:
     """The options of a command; the file that --config names gives the defaults of the settings."""
-    if {"-h", "--help"} & set(arguments):
-        options = _short(options)
     if "settings" not in options.__dataclass_fields__:
         return tyro.cli(options, prog=prog, args=arguments)
+    if {"-h", "--help"} & set(arguments) and options is not ShowConfig:
+        with _settings_left_out():
+            return tyro.cli(options, prog=prog, args=arguments)
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     finder.add_argument("--config", nargs="?")
     file = finder.parse_known_args(arguments)[0].config
     settings = load_config(file) if file else Config()
     required = {
-        field.name: tyro.MISSING
+        field.name: tyro.MISSING_NONPROP
         for field in dataclasses.fields(options)
         if field.default is field.default_factory is dataclasses.MISSING
     }
@@ -133,13 +143,14 @@ def _parse(prog: str, options: type, arguments: list[str]):
     )
 
 
-def _short(options: type) -> type:
-    """The options that a command's help shows: where a class only adds `settings` to another, that
-    other one's.
+def _settings_left_out() -> ConstructorRegistry:
+    """While it is entered, settings have no options: help would list a hundred, which `unifusion
+    config --help` does already.
     """
-    base = options.__bases__[0]
-    return (
-        base
-        if hasattr(base, "__dataclass_fields__") and "settings" in options.__dataclass_fields__
-        else options
-    )
+    registry = ConstructorRegistry()
+
+    @registry.struct_rule
+    def without_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
+        return StructConstructorSpec(Config, ()) if info.type is Config else None
+
+    return registry

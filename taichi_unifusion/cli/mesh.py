@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
@@ -12,6 +12,7 @@ from ..config import MeshSettings
 from ..errors import FileError, InputError, UniFusionError
 from ..results.run_folder import RunFolder
 from ..results.tables import format_bytes
+from .options import Device
 from .terminal import report
 
 
@@ -32,7 +33,7 @@ class ExtractMesh:
     """Where to write it: .ply, .glb or .obj; by default the meshes of single properties are written
     again too.
     """
-    device: Literal["auto", "cuda", "cpu"] = "auto"
+    device: Device = "auto"
     """Where to compute."""
 
 
@@ -51,7 +52,8 @@ def extract_mesh(options: ExtractMesh) -> int:
     maps = folder.maps
     if "surface" not in maps:
         raise FileError(
-            f"{options.dir}: no {folder.relative(folder.map('surface'))} here; give the results folder of `unifusion reconstruct`"
+            f"{options.dir}: no {folder.relative(folder.map('surface'))} here; give the results folder of "
+            "`unifusion reconstruct`"
         )
     check_writable(files[0].parent)
     from .. import pipeline, runtime

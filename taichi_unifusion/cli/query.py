@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..results.tables import format_table
+from .options import TextOptions
 from .terminal import report
-from .texts import TextOptions, read_understood
+from .texts import make_encoder, templates_of
 
 if TYPE_CHECKING:
     from ..language.questions import Answer
@@ -20,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Query(TextOptions):
+class Query:
     """Find what a text names in a reconstruction: objects, materials, activities.
 
     Example: unifusion query results/flat "sofa" "something to sit on"
@@ -29,21 +31,24 @@ class Query(TextOptions):
     query.json.
     """
 
+    dir: Annotated[Positional[Path], arg(metavar="DIR")]
+    """Results folder of `unifusion understand`."""
     texts: Annotated[Positional[tuple[str, ...]], arg(metavar="TEXT...")]
     """What to look for."""
     negative: Annotated[
         UseAppendAction[tuple[str, ...]],
         arg(metavar="TEXT", help_behavior_hint="(beside common things; give it once for each)"),
-    ] = field(default=(), kw_only=True)
+    ] = ()
     """What else may be there: a text is found where it beats all of these."""
-    threshold: Annotated[float, arg(metavar="R")] = field(default=0.5, kw_only=True)
+    threshold: Annotated[float, arg(metavar="R")] = 0.5
     """Relevance, 0..1, that makes a region; 0.5 is a draw with the strongest of what else may be
     there.
     """
-    min_area: Annotated[float, arg(metavar="M2")] = field(default=0.01, kw_only=True)
+    min_area: Annotated[float, arg(metavar="M2")] = 0.01
     """Regions of less than this area, in square metres, are left out."""
-    top: Annotated[int, arg(metavar="N")] = field(default=10, kw_only=True)
+    top: Annotated[int, arg(metavar="N")] = 10
     """Regions to list for each text."""
+    encoder: Annotated[TextOptions, arg(name="")] = field(default_factory=TextOptions)
 
 
 def query(options: Query) -> int:
@@ -58,11 +63,12 @@ def query(options: Query) -> int:
     from ..language.questions import ask
     from ..results.folder_writer import FolderWriter
     from ..results.run_folder import RunFolder
+    from ..results.understood import read_understood
 
-    understood = read_understood(options.dir, options.device)
+    understood = read_understood(options.dir, options.encoder.device)
     folder = RunFolder(check_writable(options.dir))
     writer = FolderWriter(folder)
-    encoder = options.encoder(understood.features.settings.source)
+    encoder = make_encoder(options.encoder, understood.features.settings.source, options.dir)
     answers = ask(
         understood.features,
         understood.mesh,
@@ -71,7 +77,7 @@ def query(options: Query) -> int:
         negatives=options.negative,
         threshold=options.threshold,
         min_area=options.min_area,
-        templates=options.templates,
+        templates=templates_of(options.encoder),
     )
     from ..files.meshes import write_mesh
     from ..language.pictures import cameras_that_see, heat_mesh
@@ -94,7 +100,7 @@ def query(options: Query) -> int:
         listed.append({"mesh": file.name, "picture": picture.name, **describe(answer, options.top)})
     text = json.dumps(listed, indent=2)
     writer.write(folder.answers, lambda path: write_text(path, text + "\n"))
-    print(text if options.json else "\n\n".join(_table(entry) for entry in listed))
+    print(text if options.encoder.json else "\n\n".join(_table(entry) for entry in listed))
     return report(writer.failures)
 
 
@@ -126,8 +132,8 @@ def file_name(text: str) -> str:
 def _table(entry: dict[str, Any]) -> str:
     if not entry["found"]:
         return (
-            f"{entry['text']}: not here; its relevance is {entry['highest_relevance']:.2f} at most, and something else is "
-            "nearer everywhere"
+            f"{entry['text']}: not here; its relevance is {entry['highest_relevance']:.2f} at most, "
+            "and something else is nearer everywhere"
         )
     rows = [["rank", "score", "area m2", "centre x y z m", "size m"]]
     for i, region in enumerate(entry["regions"], start=1):

@@ -4,29 +4,35 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import arg
 
 from ..config import Config
 from ..datasets import Dataset
+from ..tracking import check_poses, track
 from .interrupts import INTERRUPTED, stop_on_signal
-from .recording import RecordingOptions
+from .options import (
+    OutputOptions,
+    RecordingOptions,
+    Settings,
+    TrackingOptions,
+    open_recording,
+    source_of,
+)
 from .terminal import frame_progress, report
-from .tracking import TrackingOptions
 
 if TYPE_CHECKING:
-    from ..language import ImageEncoder
-    from ..results.run_folder import RunFolder
+    from ..networks.encoders import ImageEncoder
+    from ..results import RunFolder
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class ReconstructOptions(TrackingOptions, RecordingOptions):
+class Reconstruct:
     """Turn a recording of RGB-D frames into a coloured mesh.
 
     Example: unifusion reconstruct 7scenes my/redkitchen --every 10 --out results/kitchen
@@ -39,37 +45,32 @@ class ReconstructOptions(TrackingOptions, RecordingOptions):
     for example --device cpu, --surface.voxel-size 0.03 or --mesh.resolution 8.
     """
 
-    out: Annotated[Path, arg(metavar="DIR")] = field(kw_only=True)
-    """Folder for the results; made where it does not exist."""
-    config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(
-        default=None, kw_only=True
-    )
-    """YAML file of settings that differ from the defaults; options given here count more."""
-    json: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
-    """Print the metrics as JSON instead of tables."""
+    recording: Annotated[RecordingOptions, arg(name="")]
+    poses: Annotated[TrackingOptions, arg(name="")]
+    output: Annotated[OutputOptions, arg(name="")]
+    settings: Settings = field(default_factory=Config, kw_only=True)
 
 
-@dataclass(frozen=True)
-class Reconstruct(ReconstructOptions):
-    __doc__ = ReconstructOptions.__doc__
-
-    settings: Annotated[Config, arg(name="")] = field(default_factory=Config, kw_only=True)
+def reconstruct(options: Reconstruct) -> int:
+    """Frames -> maps -> mesh -> results folder."""
+    return fuse(open_recording(options.recording), options)
 
 
-def reconstruct(options: Reconstruct, encoder: ImageEncoder | None = None) -> int:
-    """Frames -> maps -> mesh -> results folder; with an image encoder also a map of its features."""
-    frames = options.frames()
-    options.check_poses(frames)
+def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None = None) -> int:
+    """What every command does that makes maps, of a recording that is open; with an image encoder
+    also a map of its features.
+    """
+    check_poses(recording, options.poses.tracking, options.poses.trajectory)
     from ..results.writer import prepare_results, remove_temporaries
 
-    folder = prepare_results(options.out)
+    folder = prepare_results(options.output.out)
     with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
-        return _run_and_write(options, frames, folder, stop, encoder)
+        return _fuse_and_write(recording, options, folder, stop, encoder)
 
 
-def _run_and_write(
+def _fuse_and_write(
+    recording: Dataset,
     options: Reconstruct,
-    frames: Dataset,
     folder: RunFolder,
     stop: Callable[[], bool],
     encoder: ImageEncoder | None,
@@ -78,13 +79,15 @@ def _run_and_write(
     from ..results.summary import summarize
     from ..results.writer import write_results
 
-    source, tracking, written = options.source(len(frames)), None, ()
-    if options.tracked:
-        frames, tracking = options.track(options, options.settings, folder, stop)
+    tracking, written = None, ()
+    if options.poses.tracked:
+        recording, tracking = _track(recording, options, folder, stop)
         written = folder.tracking_files
+    frames = recording[:: options.recording.every]
+    source = source_of(options.recording, len(frames))
     pipeline = Pipeline(options.settings, encoder=encoder)
     with frame_progress(len(frames)) as on_frame:
-        run = pipeline.run(frames, strict=options.strict, stop=stop, on_frame=on_frame)
+        run = pipeline.run(frames, strict=options.recording.strict, stop=stop, on_frame=on_frame)
     if not run.steps:
         logger.warning(
             "stopped before the first frame was done; %s",
@@ -104,8 +107,39 @@ def _run_and_write(
     results = write_results(folder.path, pipeline, run, source, tracking, written)
     print(
         json.dumps(results.record.to_json(), indent=2)
-        if options.json
+        if options.output.json
         else summarize(results.record, results.files, folder.path)
     )
     code = report([error for error in (run.failure, *results.failures) if error])
     return INTERRUPTED if stop() else code
+
+
+def _track(
+    recording: Dataset, options: Reconstruct, folder: RunFolder, stop: Callable[[], bool]
+) -> tuple[Dataset, Mapping[str, Any]]:
+    """The frames with the poses that are asked for, and what to say of them in the record.
+
+    All frames are tracked, whatever --every leaves for the map: small steps are easier. Poses are
+    written at once, so that they outlive whatever comes after.
+    """
+    from .. import runtime
+    from ..files.trajectories import write_trajectory
+    from ..tracking.sequence import write_tracking
+
+    poses, settings = options.poses, options.settings
+    runtime.init(settings.device, threads=settings.threads or None)
+    with frame_progress(len(recording)) as on_frame:
+        posed = track(
+            recording,
+            settings.tracking,
+            settings.preprocess,
+            mode=poses.tracking,
+            trajectory=poses.trajectory,
+            interpolate=poses.interpolate,
+            max_difference=options.recording.max_difference,
+            stop=stop,
+            on_frame=on_frame,
+        )
+    write_tracking(folder.tracking, posed.tracking)
+    write_trajectory(folder.tracked_poses, posed.tracking.trajectory)
+    return posed, {"mode": poses.tracking, **posed.tracking.details}

@@ -8,44 +8,32 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from tyro.conf import FlagCreatePairsOff, arg
-
+from .options import ScoreOptions
 from .terminal import DONE
 
 
-@dataclass(frozen=True)
-class ScoreOptions:
-    """Where the numbers go."""
+def check_out(options: ScoreOptions) -> None:
+    """Raise FileError if the file for the numbers cannot be written, before any work is spent."""
+    if options.out:
+        from ..files.atomic import check_writable
 
-    json: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
-    """Print the numbers as JSON instead of a table."""
-    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(
-        default=None, kw_only=True
-    )
-    """Write the numbers there too, as JSON."""
+        check_writable(options.out.parent)
 
-    def check_out(self) -> None:
-        """Raise FileError if `out` cannot be written, before any work is spent."""
-        if self.out:
-            from ..files.atomic import check_writable
 
-            check_writable(self.out.parent)
+def show(options: ScoreOptions, about: Mapping[str, Any], result: Any, *blocks: str) -> int:
+    """Print blocks of text with an empty line between them, or JSON, and write the file; returns
+    the exit code. `result` is a dataclass.
+    """
+    text = json.dumps(_plain({**about, **dataclasses.asdict(result)}), indent=2)
+    if options.out:
+        from ..files.atomic import write_text
 
-    def show(self, about: Mapping[str, Any], result: Any, *blocks: str) -> int:
-        """Print blocks of text with an empty line between them, or JSON, and write the file;
-        returns the exit code.
-        """
-        text = json.dumps(_plain({**about, **dataclasses.asdict(result)}), indent=2)
-        if self.out:
-            from ..files.atomic import write_text
-
-            write_text(self.out, text + "\n")
-        print(text if self.json else "\n\n".join(blocks))
-        return DONE
+        write_text(options.out, text + "\n")
+    print(text if options.json else "\n\n".join(blocks))
+    return DONE
 
 
 def cell(value: float | None, digits: int = 2, factor: float = 1.0) -> str:

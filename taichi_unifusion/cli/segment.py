@@ -10,16 +10,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from ..errors import InputError
 from ..results.tables import format_table
+from .options import OPTIONAL, TextOptions
 from .terminal import report
-from .texts import TextOptions, read_understood
+from .texts import make_encoder, templates_of
 
 
 @dataclass(frozen=True)
-class Segment(TextOptions):
+class Segment:
     """Label a reconstruction with the best of a list of names at every vertex.
 
     Example: unifusion segment results/flat --labels names.txt
@@ -30,16 +31,17 @@ class Segment(TextOptions):
     With --truth, `unifusion evaluate segmentation` measures the same.
     """
 
-    labels: Annotated[Path, arg(metavar="FILE")] = field(kw_only=True)
-    """Names, one a line; a line may begin with a number, which then is the label, as in '3 kitchen
-    table'.
+    dir: Annotated[Positional[Path], arg(metavar="DIR")]
+    """Results folder of `unifusion understand`."""
+    labels: Annotated[Path, arg(metavar="FILE")]
+    """Names, one a line; a line may begin with a number, which then is the label, as in
+    '3 kitchen table'.
     """
-    truth: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(optional)")] = field(
-        default=None, kw_only=True
-    )
+    truth: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
     """Points with true labels, a PLY file with a property `label`: IoU and accuracy are measured
     there.
     """
+    encoder: Annotated[TextOptions, arg(name="")] = field(default_factory=TextOptions)
 
 
 def segment(options: Segment) -> int:
@@ -52,18 +54,19 @@ def segment(options: Segment) -> int:
     from ..language.questions import segment as segment_points
     from ..results.folder_writer import FolderWriter
     from ..results.run_folder import RunFolder
+    from ..results.understood import read_understood
 
     truth = _read_truth(options.truth) if options.truth else None
-    understood = read_understood(options.dir, options.device)
+    understood = read_understood(options.dir, options.encoder.device)
     folder = RunFolder(check_writable(options.dir))
     writer = FolderWriter(folder)
-    encoder = options.encoder(understood.features.settings.source)
+    encoder = make_encoder(options.encoder, understood.features.settings.source, options.dir)
     found = segment_points(
         understood.features,
         understood.mesh.vertices,
         encoder,
         tuple(names.values()),
-        templates=options.templates,
+        templates=templates_of(options.encoder),
     )
     colors = label_colors(len(names))
     mesh = label_mesh(understood.mesh, found, tuple(names), colors)
@@ -76,10 +79,12 @@ def segment(options: Segment) -> int:
     )
     summary: dict[str, Any] = {"labels": _shares(names, found, colors)}
     if truth is not None:
-        summary["scores"] = _scores(understood.features, encoder, names, truth, options.templates)
+        summary["scores"] = _scores(
+            understood.features, encoder, names, truth, templates_of(options.encoder)
+        )
     text = json.dumps(summary, indent=2)
     writer.write(folder.segmentation, lambda path: write_text(path, text + "\n"))
-    print(text if options.json else _tables(summary, writer.files))
+    print(text if options.encoder.json else _tables(summary, writer.files))
     return report(writer.failures)
 
 

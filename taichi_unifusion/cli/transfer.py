@@ -4,20 +4,19 @@ pass.
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from tyro.conf import UseAppendAction, arg
 
-from ..config import Config
 from ..errors import InputError
 from ..properties import PROPERTIES
-from .reconstruct import Reconstruct, ReconstructOptions, reconstruct
+from .options import ONE_EACH
+from .reconstruct import Reconstruct, reconstruct
 
 
 @dataclass(frozen=True)
-class TransferOptions(ReconstructOptions):
+class Transfer(Reconstruct):
     """Map properties of the frames (infrared, saliency, style, ...) onto the surface, beside its
     colour, in one pass.
 
@@ -38,17 +37,10 @@ class TransferOptions(ReconstructOptions):
         UseAppendAction[tuple[str, ...]],
         arg(
             metavar="NAME[=SETTINGS]",
-            help_behavior_hint="(give it once for each)",
+            help_behavior_hint=ONE_EACH,
             help=f"What to map: {', '.join(PROPERTIES)}; docs/properties.md lists their methods and options.",
         ),
     ] = field(default=(), kw_only=True)
-
-
-@dataclass(frozen=True)
-class Transfer(TransferOptions):
-    __doc__ = TransferOptions.__doc__
-
-    settings: Annotated[Config, arg(name="")] = field(default_factory=Config, kw_only=True)
 
 
 def transfer(options: Transfer) -> int:
@@ -58,9 +50,4 @@ def transfer(options: Transfer) -> int:
         raise InputError(
             f"transfer: say what to map, with --property NAME; properties: {', '.join(PROPERTIES)}"
         )
-    given = {
-        each.name: getattr(options, each.name) for each in dataclasses.fields(ReconstructOptions)
-    }
-    return reconstruct(
-        Reconstruct(**given, settings=dataclasses.replace(options.settings, properties=properties))
-    )
+    return reconstruct(replace(options, settings=replace(options.settings, properties=properties)))

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from ..config import Config
-from .reconstruct import Reconstruct, ReconstructOptions, reconstruct
+from .options import open_recording
+from .reconstruct import Reconstruct, fuse
 
 
 @dataclass(frozen=True)
-class UnderstandOptions(ReconstructOptions):
+class Understand(Reconstruct):
     """Map image-text features (CLIP and its kin) onto the surface, beside its colour, in one pass;
     then ask with `query`.
 
@@ -44,16 +43,10 @@ class UnderstandOptions(ReconstructOptions):
     """
 
 
-@dataclass(frozen=True)
-class Understand(UnderstandOptions):
-    __doc__ = UnderstandOptions.__doc__
-
-    settings: Annotated[Config, arg(name="")] = field(default_factory=Config, kw_only=True)
-
-
 def understand(options: Understand) -> int:
     """Frames -> maps -> mesh -> results folder."""
-    options.frames()  # a recording that cannot be read is said before a network is loaded
+    # first: a recording that cannot be read is said before a network is loaded
+    recording = open_recording(options.recording)
     from ..language import make_image_encoder
 
     device = options.settings.device
@@ -67,8 +60,4 @@ def understand(options: Understand) -> int:
         "onnx": {"patch": options.patch, "device": device},
         "folder": {"layout": options.layout},
     }.get(options.features.partition(":")[0], {})
-    encoder = make_image_encoder(options.features, **choices)
-    given = {
-        each.name: getattr(options, each.name) for each in dataclasses.fields(ReconstructOptions)
-    }
-    return reconstruct(Reconstruct(**given, settings=options.settings), encoder)
+    return fuse(recording, options, make_image_encoder(options.features, **choices))

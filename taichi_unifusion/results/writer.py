@@ -140,8 +140,8 @@ def _write_mesh_files(writer: FolderWriter, mesh: Mesh, pipeline: Pipeline, run:
     if not len(mesh.faces):
         writer.failures.append(
             InputError(
-                f"the mesh is empty: {len(run.steps)} frames gave no surface; look at preprocess.depth_max, surface.min_points and "
-                "surface.support_points, or use more frames"
+                f"the mesh is empty: {len(run.steps)} frames gave no surface; look at preprocess.depth_max, "
+                "surface.min_points and surface.support_points, or use more frames"
             )
         )
         wanted &= {folder.mesh}  # the other formats cannot hold an empty mesh

@@ -1,0 +1,197 @@
+"""Options that several commands share, as values: a recording, where poses come from, where results
+go, a text encoder, where numbers go.
+
+A command nests them, with `name=""` so that their flags have no prefix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+from ..config import Config
+from ..datasets import FORMATS, Dataset, open_dataset, parse_options
+from ..errors import DatasetError, InputError
+from ..results.record import Source
+from ..tracking import Mode
+
+FORMAT_DEFAULT = "(default: the format's)"
+OPTIONAL = "(optional)"
+ONE_EACH = "(give it once for each)"
+
+Settings = Annotated[Config, arg(name="")]
+Device = Literal["auto", "cuda", "cpu"]
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """Which frames of which recording, and how to read it."""
+
+    format: Annotated[
+        Positional[str], arg(metavar="FORMAT", help=f"The kind of recording: {', '.join(FORMATS)}.")
+    ]
+    path: Annotated[
+        Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint="(synthetic needs none)")
+    ] = None
+    """Where the recording lies."""
+    start: Annotated[int, arg(metavar="A")] = 0
+    """First frame, counted from 0."""
+    end: Annotated[int | None, arg(metavar="B", help_behavior_hint="(default: all)")] = None
+    """Frame to stop before."""
+    every: Annotated[int, arg(metavar="N")] = 1
+    """Use every N-th frame."""
+    option: Annotated[
+        UseAppendAction[tuple[str, ...]], arg(metavar="KEY=VALUE", help_behavior_hint=ONE_EACH)
+    ] = ()
+    """Another option of the format, as align=color for k4a; a wrong one lists them."""
+    depth_scale: Annotated[float | None, arg(metavar="S", help_behavior_hint=FORMAT_DEFAULT)] = None
+    """Units of the depth images that make a metre."""
+    drop_alpha: FlagCreatePairsOff[bool] = False
+    """Accept colour images with a fourth channel and ignore it."""
+    max_difference: Annotated[
+        float | None, arg(metavar="SECONDS", help_behavior_hint=FORMAT_DEFAULT)
+    ] = None
+    """How far time stamps of depth, colour and pose may be apart (tum, folder)."""
+    camera_path: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(scene needs one)")
+    ] = None
+    """Poses to render a scene from: lines 'timestamp tx ty tz qx qy qz qw', camera to world."""
+    strict: FlagCreatePairsOff[bool] = False
+    """Stop at the first frame that cannot be used, instead of skipping it."""
+
+
+@dataclass(frozen=True)
+class TrackingOptions:
+    """Where camera poses come from."""
+
+    tracking: Mode = "given"
+    """Camera poses. given: the recording's; external: from --trajectory; internal: either of them,
+    refined; rgbd: from the frames alone."""
+    trajectory: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
+    """Poses of another program: TUM, KITTI or Replica file, or a folder of one matrix a frame."""
+    interpolate: FlagCreatePairsOff[bool] = False
+    """Fill gaps of up to a second between the poses of --trajectory."""
+
+    @property
+    def tracked(self) -> bool:
+        """Whether poses come from elsewhere than the recording, or are meant to."""
+        return self.tracking != "given" or self.trajectory is not None or self.interpolate
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Where the results of a run go, and what its settings begin with."""
+
+    out: Annotated[Path, arg(metavar="DIR")]
+    """Folder for the results; made where it does not exist."""
+    config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
+    """YAML file of settings that differ from the defaults; options given here count more."""
+    json: FlagCreatePairsOff[bool] = False
+    """Print the metrics as JSON instead of tables."""
+
+
+@dataclass(frozen=True)
+class TextOptions:
+    """What turns words into vectors, for questions to a map of features."""
+
+    text: Annotated[
+        str | None,
+        arg(metavar="ENCODER", help_behavior_hint="(default: the one that made the features)"),
+    ] = None
+    """Text encoder: clip:MODEL, onnx:FILE.onnx, or embeddings:FILE (.npz, or .npy with --names)."""
+    names: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
+    """Names of the vectors of an embeddings file: .txt, .csv or .json."""
+    tokenizer: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
+    """CLIP's byte-pair merges, for a text encoder in an ONNX file."""
+    template: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="TEXT", help_behavior_hint="(default: five; give it once for each)"),
+    ] = ()
+    """What a name is put into, at its {}, such as 'a photo of a {}'; embeddings are averaged over
+    templates.
+    """
+    download: FlagCreatePairsOff[bool] = False
+    """Allow a CLIP model to be fetched from the Hugging Face hub; without it only what lies on this
+    machine is used.
+    """
+    json: FlagCreatePairsOff[bool] = False
+    """Print JSON instead of tables."""
+    device: Device = "auto"
+    """Where to compute."""
+
+
+@dataclass(frozen=True)
+class ScoreOptions:
+    """Where the numbers of an evaluation go."""
+
+    json: FlagCreatePairsOff[bool] = False
+    """Print the numbers as JSON instead of a table."""
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
+    """Write the numbers there too, as JSON."""
+
+
+def open_recording(options: RecordingOptions) -> Dataset:
+    """All frames from --start to --end, whatever --every says; raises DatasetError if there are
+    none.
+    """
+    recording = open_dataset(options.format, options.path, **reading_options(options))
+    asked = frames_asked(recording, options.start, options.end, options.every)
+    return recording[asked.start : options.end]
+
+
+def source_of(options: RecordingOptions, frames: int) -> Source:
+    """What the record of a run keeps of the recording; `frames` were asked for."""
+    return Source(
+        format=options.format,
+        path=str(options.path or ""),
+        start=options.start,
+        end=options.end,
+        every=options.every,
+        reading={
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in reading_options(options).items()
+        },
+        frames=frames,
+    )
+
+
+def reading_options(options: RecordingOptions) -> dict[str, Any]:
+    """Options for `open_dataset`: those that were given."""
+    flags = {
+        "depth_scale": options.depth_scale,
+        "max_difference": options.max_difference,
+        "drop_alpha": options.drop_alpha or None,
+        "trajectory": options.camera_path,
+    }
+    given = {name: value for name, value in flags.items() if value is not None}
+    return merged_options(options.format, given, options.option)
+
+
+def merged_options(format: str, given: dict[str, Any], texts: tuple[str, ...]) -> dict[str, Any]:
+    """Options given by flags of their own together with those of --option; InputError for one that
+    is given in both ways.
+    """
+    more = parse_options(format, texts) if texts else {}
+    for name in more:
+        if name in given:
+            raise InputError(f"option '{name}' is given twice, once with --option")
+    return {**given, **more}
+
+
+def frames_asked(recording: Dataset, start: int, end: int | None, every: int) -> range:
+    """Places of the frames that are asked for; InputError where these make no sense, DatasetError
+    where there are none.
+    """
+    if start < 0 or every < 1 or (end is not None and end <= start):
+        raise InputError(
+            f"frames: need 0 <= start < end and every >= 1, got start {start}, end {end}, every {every}"
+        )
+    asked = range(len(recording))[start:end:every]
+    if not asked:
+        raise DatasetError(
+            f"{recording.name}: there is no frame {start}, it has {len(recording)} (0 is the first)"
+        )
+    return asked

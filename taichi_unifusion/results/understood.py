@@ -1,0 +1,48 @@
+"""A results folder as questions need it: its mesh, its map of features, where its cameras were."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from .. import runtime
+from ..errors import FileError, InputError
+from ..files.mesh_reading import read_mesh
+from ..files.trajectories import read_trajectory
+from ..maps import LatentMap
+from ..pipeline import FEATURES
+from ..types import Mesh, Trajectory
+from .run_folder import RunFolder
+
+
+@dataclass(frozen=True)
+class Understood:
+    """What a results folder holds for questions."""
+
+    mesh: Mesh
+    features: LatentMap
+    trajectory: Trajectory | None
+
+
+def read_understood(directory: Path, device: str) -> Understood:
+    """Mesh, map of features and trajectory of a results folder; raises FileError where one is
+    missing or damaged.
+    """
+    folder = RunFolder(directory)
+    file = folder.map(FEATURES)
+    if not file.exists():
+        raise FileError(
+            f"{directory}: no {folder.relative(file)} here; give the results folder of `unifusion understand`"
+        )
+    if not folder.mesh.exists():
+        raise FileError(
+            f"{directory}: no {folder.mesh.name} here; `unifusion mesh {directory}` makes it again"
+        )
+    mesh = read_mesh(folder.mesh)
+    if not len(mesh.vertices) or not len(mesh.faces):
+        raise InputError(f"{folder.mesh}: the mesh is empty, there is nothing to ask")
+    runtime.init(device)
+    poses = folder.trajectory
+    return Understood(
+        mesh, LatentMap.load(file), read_trajectory(poses) if poses.exists() else None
+    )
