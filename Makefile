@@ -1,6 +1,9 @@
 # From a bare Debian or Ubuntu machine with Python 3.11-3.13 to a result: `make demo`, `make test`.
 # `make demo PYTHON=python3.12` chooses the interpreter; `make test PYTEST_ARGS="-k surface"` hands options to pytest.
+# WORKERS processes share the tests, a file at a time, so that fixtures of a file are made once; each takes 1 to 2 GB.
 .PHONY: demo test lint format setup
+
+WORKERS ?= 2
 
 # ROS and the like point these at another Python's packages.
 unexport PYTHONPATH PYTHONHOME
@@ -9,7 +12,7 @@ demo: setup
 	.venv/bin/unifusion reconstruct synthetic --out results/demo
 
 test: setup
-	.venv/bin/python -m pytest $(PYTEST_ARGS)
+	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 lint: setup
 	.venv/bin/ruff check
