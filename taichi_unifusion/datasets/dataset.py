@@ -1,6 +1,4 @@
-"""What every data set is: a sequence of frames that can be sliced, loaded one by one when asked
-for.
-"""
+"""What every data set is: a sequence of frames, each loaded when indexed; slices are views."""
 
 from __future__ import annotations
 
@@ -15,15 +13,15 @@ class Dataset(ABC, Sequence[Frame]):
     """Frames of one recording: `dataset[i]` loads frame i (or raises FrameError), `dataset[a:b:n]`
     is a view.
 
-    `name` says what and where, for messages. Opening is cheap: it lists files, reads poses and
-    intrinsics, and raises DatasetError where there is nothing to read. `warnings` holds sentences
-    on what was odd but usable.
+    `name` is the format and the path, for messages. Opening is cheap: it lists files, reads poses
+    and intrinsics, and raises DatasetError where there is nothing to read. `warnings` holds
+    sentences about what is unusual but usable.
     """
 
     name: str
     warnings: tuple[str, ...] = ()
-    no_poses: str = ""  # why none of its frames has a pose, where that is so
-    # whether loading launches kernels: those of two threads must not overlap
+    no_poses: str = ""  # why no frame has a pose; empty if some have one
+    # loading launches kernels, and two threads must not launch kernels at once
     runs_kernels: bool = False
 
     @abstractmethod
@@ -34,7 +32,7 @@ class Dataset(ABC, Sequence[Frame]):
         """Load frame `index` of 0..len-1."""
 
     def without_poses(self) -> Dataset:
-        """The same frames where their poses do not matter: broken or missing ones cost nothing."""
+        """A view without poses, so that frames with broken poses still load. Default: unchanged."""
         return self
 
     @overload

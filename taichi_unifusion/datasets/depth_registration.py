@@ -1,5 +1,5 @@
-"""A camera with lens distortion, and images carried from it to a pinhole in its place and on to
-another camera beside it.
+"""Registration of two cameras' images: undistort one's images, and resample them as the other
+camera sees them.
 
 Distortion is the rational model of Brown and Conrady as OpenCV has it: k1 k2 p1 p2 k3 k4 k5 k6.
 """
@@ -15,32 +15,30 @@ from numpy.typing import NDArray
 
 from ..types import PinholeCamera
 
-SAME_SURFACE = 0.03  # relative depth step up to which neighbouring readings may be interpolated
-# relative depth behind the nearest reading in its neighbourhood from which a point is not seen
-HIDDEN = 0.05
-# tan of the angle off the axis to which a distortion model holds, where a calibration does not say
-MAX_RADIUS = 1.7
+SAME_SURFACE = 0.03  # relative depth step; beyond it there is an edge, no interpolation
+HIDDEN = 0.05  # relative depth behind the nearest reading around; further behind is occluded
+MAX_RADIUS = 1.7  # tan of the angle off the axis up to which the distortion model holds by default
 
 
 @dataclass(frozen=True)
 class LensCamera:
-    """A pinhole camera with distortion in front of it."""
+    """A pinhole camera with lens distortion."""
 
     pinhole: PinholeCamera
     distortion: tuple[float, ...]  # k1 k2 p1 p2 k3 k4 k5 k6
     max_radius: float = MAX_RADIUS
 
     def undistort(self, image: NDArray, target: PinholeCamera) -> NDArray:
-        """Colours (H, W, 3) or measurements (H, W) as `target`, in the same place and direction,
-        sees them; 0 outside.
+        """Colours (H, W, 3) or measurements (H, W) resampled to the pinhole camera `target` with
+        the same pose; 0 outside.
         """
         return cv2.remap(
             image, *_undistortion(self, target), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
         )
 
     def sees(self, target: PinholeCamera) -> NDArray[np.bool_]:
-        """Where (H, W) this camera's image covers what `target`, in the same place and direction,
-        sees.
+        """The pixels (H, W) of the pinhole camera `target`, with the same pose, that this camera's
+        image covers.
         """
         map_x, map_y = _undistortion(self, target)
         width, height = self.pinhole.size
@@ -49,7 +47,7 @@ class LensCamera:
     def undistort_depth(
         self, depth: NDArray[np.float32], target: PinholeCamera
     ) -> NDArray[np.float32]:
-        """The same for depth (H, W) [m], 0 none: never a mean across an edge."""
+        """`undistort` for depth (H, W) [m], 0 no reading; it never averages across an edge."""
         map_x, map_y = _undistortion(self, target)
         left, top = np.floor(map_x), np.floor(map_y)
         a, b = map_x - left, map_y - top
@@ -136,11 +134,11 @@ def color_for_depth(
     columns, rows, z = project_depth(_filled(depth), camera, color_camera, T_color_camera)
     width, height = color_camera.size
     inside = (columns > -0.5) & (rows > -0.5) & (columns < width - 0.5) & (rows < height - 0.5)
-    # the rim mixes with black
+    # without the outermost pixels, which interpolation mixes with black
     covered = cv2.erode(lens.sees(color_camera).astype(np.uint8), np.ones((3, 3)))
     covered = cv2.remap(covered, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
     known = inside & (depth > 0)
-    # pixels of the colour camera: wide enough to hold a reading each
+    # [pixels of the colour camera] so wide that each cell has at least one reading
     cell = 2 * max(color_camera.fx / camera.fx, 0.5)
     at = tuple(
         np.where(inside, np.maximum(pixels, 0) / cell, 0).astype(np.int32)

@@ -1,8 +1,7 @@
-"""A recording kept as files, one depth image, one colour image and one pose a frame: what most
-formats come down to.
+"""A recording of one depth image, one colour image and one pose for each frame, all in files: what
+most formats are.
 
-The modules beside this one list the files of their format and hand them over; loading is the same
-for all.
+The modules of the formats list the files; loading them is the same for all.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ from ..types import Frame, PinholeCamera
 from .dataset import Dataset
 from .plausibility import camera_warnings, pose_warnings
 
-SIZE_SAMPLES = 5  # depth headers read to learn the size, so that one odd file does not decide it
+SIZE_SAMPLES = 5  # depth headers to read; the size that most have counts
 
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """Where the parts of one frame are expected; None: the recording has no such part at all."""
+    """Files that a frame should have; None: the recording has no such files at all."""
 
     depth: Path
     color: Path | None = None
@@ -45,7 +44,7 @@ class FrameFiles:
 
 
 class Recording(Dataset):
-    """Frames read from files when asked for.
+    """Frames read from files when indexed.
 
     `depth_scale` is in units a metre, `invalid` the units that mean no reading, `fit_color`
     resamples colour of another size, `no_poses` says what is missing where no frame has a pose.
@@ -89,7 +88,7 @@ class Recording(Dataset):
         return bare
 
     def load(self, index: int) -> Frame:
-        """Read frame `index`; FrameError (PoseError, SizeMismatch) names the file that is at fault."""
+        """Read frame `index`; FrameError (PoseError, SizeMismatch) names the faulty file."""
         files = self.frames[index]
         T_world_camera = files.pose.checked() if files.pose else None
         depth = read_depth(files.depth, self.depth_scale, self.invalid)
@@ -101,7 +100,7 @@ class Recording(Dataset):
         frame = Frame(
             depth, self.camera, color, T_world_camera, index, files.timestamp, str(files.depth)
         )
-        # a frame may lack it, as it may lack a reading
+        # infrared may be missing for single frames
         if files.infrared is None or not files.infrared.exists():
             return frame
         infrared = read_infrared(files.infrared)

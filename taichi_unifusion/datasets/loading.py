@@ -1,4 +1,4 @@
-"""Frames one ahead: a thread reads the next frame while the caller works on the one before."""
+"""Loading ahead: a thread reads the next frame while the caller works on the current one."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 from ..types import Frame
-from . import DatasetView
+from .dataset import DatasetView
 
 
 def load_ahead(sequence: Sequence[Frame]) -> Iterator[Callable[[], Frame]]:
-    """One loader a frame, in order; a thread loads the next frame while the caller works on the one
-    before.
-
-    Calling the loader returns the frame or raises what loading it raised.
+    """Yield one function for each frame, in order: it returns the frame, or raises what loading
+    the frame raised. A thread loads the next frame meanwhile.
     """
-    # launches from two threads must not overlap
+    # two threads must not launch kernels at once: load each frame in the caller's thread
     if getattr(recording_of(sequence), "runs_kernels", False):
         yield from (partial(sequence.__getitem__, i) for i in range(len(sequence)))
         return
@@ -31,14 +29,14 @@ def load_ahead(sequence: Sequence[Frame]) -> Iterator[Callable[[], Frame]]:
 
 
 def recording_of(sequence: Sequence[Frame]) -> Sequence[Frame]:
-    """The data set behind views of it."""
+    """The data set that a view, or a view of a view, shows."""
     while isinstance(sequence, DatasetView):
         sequence = sequence.dataset
     return sequence
 
 
 def index_in_recording(sequence: Sequence[Frame], i: int) -> int:
-    """The place in the data set behind views of what is frame i of the view."""
+    """Index in the underlying data set of frame `i` of a view."""
     while isinstance(sequence, DatasetView):
         sequence, i = sequence.dataset, sequence.indices[i]
     return i

@@ -1,5 +1,5 @@
-"""What is odd about a recording but usable, as sentences: its poses and camera (when opened), its
-depth scale (first frame).
+"""Is a recording plausible? Sentences about its poses and camera (when it is opened) and its depth
+scale (from the first frame).
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from ..files.trajectories import Pose
 from ..types import PinholeCamera
 
-MIN_IDENTITIES = 3  # the first frame often is the origin; more of them mean that nobody tracked
+MIN_IDENTITIES = 3  # one is normal, the first frame; this many mean that tracking failed
 MAX_JUMP = 1.0  # [m] between consecutive frames
-OFF_CENTRE = 0.15  # of the image size: lenses are centred better than this
+OFF_CENTRE = 0.15  # share of the image size; real principal points are nearer to the centre
 
-PLAUSIBLE_MEDIAN = (0.05, 30.0)  # [m] of a depth image; outside it the scale is wrong
-TYPICAL_MEDIAN = (0.3, 10.0)  # [m] of indoor recordings
-COMMON_MEDIAN = 2.0  # [m] where two scales fit, the one nearer to this comes first
+PLAUSIBLE_MEDIAN = (0.05, 30.0)  # [m] median depth; outside, the scale is wrong
+TYPICAL_MEDIAN = (0.3, 10.0)  # [m] median depth of indoor recordings
+COMMON_MEDIAN = 2.0  # [m] of two scales that fit, the one that gives nearly this comes first
 # units a metre: millimetres, TUM, Replica, 0.1 mm, metres
 KNOWN_SCALES = (1000.0, 5000.0, 6553.5, 10000.0, 1.0)
 

@@ -1,9 +1,8 @@
-"""Are the poses what they should be, camera to world with z forward? Two frames that overlap can
-tell.
+"""Are the poses camera to world with z forward? Two overlapping frames can tell.
 
-Points of one frame, carried by the poses into another, should lie where that one measured them.
-Where they do not, but would under another reading of the same matrices, that reading is probably
-the right one.
+Points of one frame, transformed by the poses into another, should lie where that frame measured
+them. If they do not, but do under another convention of the same matrices, the recording probably
+uses that convention.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from ..types import Frame
 GRID = 48  # points along each image axis
 NEAREST = 0.1  # [m] nothing nearer to a camera is compared
 TOLERANCE = 0.03  # share of the depth within which two measurements agree
-# agreement that a right reading has at least, and its lead over a wrong one
+# least agreement under the right convention, and its lead over a wrong one
 PLAUSIBLE, CLEARLY_BETTER = 0.5, 0.3
-MIN_POINTS = 100  # that another frame sees, to say anything
-MIN_MOTION = 0.05, np.radians(3)  # [m], [rad]: with less, all readings agree
+MIN_POINTS = 100  # seen by both frames; with fewer nothing is concluded
+MIN_MOTION = 0.05, np.radians(3)  # [m], [rad]; with less, all conventions agree
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 READINGS = {

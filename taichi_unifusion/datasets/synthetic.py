@@ -27,7 +27,7 @@ from .dataset import Dataset
 
 FOCAL_PER_WIDTH = 575.0 / 640.0  # Kinect v1's depth camera
 FRAME_RATE = 30.0  # [Hz]
-NEAR_PLANE = 0.05  # [m] culling clips what lies nearer
+NEAR_PLANE = 0.05  # [m] of culling
 GROUND_STEP = 0.02  # [m] grid of the shadows on the floor
 UNIT_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 UNIT_EDGES = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 
 from ..errors import FrameError
 
-# three times an 8k image: more is a damaged or hostile header, not a frame
+# three times an 8k image; a larger size means a damaged or hostile header
 MAX_PIXELS = 100_000_000
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-# SOF markers; the three are tables
+# start-of-frame markers; the three left out are tables
 JPEG_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 JPEG_START_OF_SCAN = 0xDA
 JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
@@ -119,8 +119,8 @@ def _jpeg_header(data: bytes) -> ImageHeader | None:
 
 
 def _jpeg_is_whole(data: bytes, header: ImageHeader) -> str | None:
-    # inside a scan 0xFF is always escaped, so the marker cannot occur by chance; an embedded
-    # thumbnail's lies before it
+    # inside a scan 0xFF is always escaped, so the end marker cannot occur by chance; that of an
+    # embedded thumbnail lies before the scan
     return None if data.rfind(JPEG_END) > header.data_offset else f"cut off after {len(data)} bytes"
 
 

@@ -21,7 +21,7 @@ from .image_headers import MAX_PIXELS, check_whole, read_header
 
 INVALID_DEPTH = (0, 65535)  # no reading; 65535 is also what 16 bits saturate at
 SAME_ASPECT = 0.01  # relative difference of width/height up to which colour is resized to depth
-HEADER_BYTES = 4096  # enough for the size in a PNG or PGM header
+HEADER_BYTES = 4096  # the size in a PNG or PGM header stands within these
 
 
 def read_color(path: Path, *, drop_alpha: bool = False) -> NDArray[np.uint8]:
@@ -55,7 +55,7 @@ def read_depth(
     """The depth image at `path` as (H, W) metres, 0 where there is no reading.
 
     PNG and PGM hold 16-bit integers, `depth_scale` units a metre, `invalid` among them. NPY holds
-    such integers, or floats, which are metres as they stand.
+    such integers, or floats, which are metres already.
     """
     if path.suffix.lower() != ".npy":
         return depth_to_metres(

@@ -27,15 +27,15 @@ from .atomic import atomic_write, file_error
 
 FORMAT = "taichi_unifusion LIM"
 FORMAT_VERSION = 1
-MAX_HEADER = 64 << 20  # bytes; ours have some thousand
+MAX_HEADER = 64 << 20  # [bytes]; ours have a few thousand
 MAX_DIMENSIONS = 8
-# of one tensor, empty dimensions counted as 1: no product of sizes overflows
+# of one tensor, counting empty dimensions as 1, so that no product of sizes overflows
 MAX_ELEMENTS = 1 << 48
 
 # tensor -> type and shape, in the order of their bytes
 Layout = dict[str, tuple[np.dtype, tuple[int, ...]]]
 
-# keys in the header's __metadata__
+# keys of the header's __metadata__
 _MANIFEST, _CHECKSUM = "taichi_unifusion", "taichi_unifusion_sha256"
 _DTYPES = {
     "F64": "<f8",
@@ -68,7 +68,7 @@ def write_map(
     the file cannot be written.
     """
     arrays = {name: _storable(name, array) for name, array in tensors.items()}
-    # so that each one is aligned
+    # large items first, so that every tensor is aligned
     arrays = dict(sorted(arrays.items(), key=lambda item: (-item[1].itemsize, item[0])))
     entries, header, offset = {}, {}, 0
     for name, array in arrays.items():

@@ -14,7 +14,7 @@ from ..errors import FileError
 from ..types import Mesh
 from .ply import property_names
 
-MAX_HEADER = 1 << 16  # bytes; real headers have some hundred
+MAX_HEADER = 1 << 16  # [bytes]; real headers have a few hundred
 
 _TYPES = {
     "char": "i1",
@@ -66,7 +66,7 @@ def parse_ply(data: bytes, name: str) -> Mesh:
         1.0,
     )
     body = data[start:]
-    # then every number is a word; as float64 they are read like a binary file of one type
+    # the words of an ascii file become float64, read like a binary file of this one type
     if encoding == "ascii":
         try:
             body = np.array(body.split(), dtype="<f8").tobytes()
@@ -181,18 +181,18 @@ def _read_element(
     table = np.frombuffer(
         body, row, min(element.rows, (len(body) - offset) // row.itemsize), offset
     )
-    alike = np.logical_and.reduce(
+    as_first = np.logical_and.reduce(
         [np.ones(len(table), bool), *(table["#" + key] == lengths[key] for key in lists)]
     )
-    # rows as long as the first one: no copy, no loop
-    table = table[: len(table) if alike.all() else alike.argmin()]
+    # rows of the same list lengths as the first one are read at once, without copies
+    table = table[: len(table) if as_first.all() else as_first.argmin()]
     offset += table.nbytes
     if len(table) == element.rows:
         return _Columns(
             {key: table[key] for key in numbers}, {key: table[key] for key in lists}
         ), offset
     values_of = {key: list(table[key]) if key in lists else [table[key]] for key in numbers + lists}
-    # from the first row that differs, or where the file ends, one by one
+    # from the first row of other lengths, or at the end of the file, row by row
     for _ in range(len(table), element.rows):
         row_values = list(_read_row(body, offset, element, order, name))
         for p, values, _ in row_values:

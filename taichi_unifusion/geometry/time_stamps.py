@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 
-LONGEST_DIFFERENCE = 1.0  # [s]; beyond it pairs mean nothing and their number grows without bound
+LONGEST_DIFFERENCE = 1.0  # [s]; with more, pairs mean nothing and their number explodes
 
 
 def associate(
@@ -26,7 +26,7 @@ def associate(
     count = np.maximum(last - first, 0)
     i = np.repeat(np.arange(len(a)), count)
     j = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - first, count)
-    # stable: equal differences pair the earlier stamps
+    # a stable sort: of equal differences the earlier stamps are paired first
     order = np.argsort(np.abs(a[i] - b[j]), kind="stable")
     free_a, free_b = np.ones(len(a), bool), np.ones(len(b), bool)
     pairs = []
