@@ -1,4 +1,6 @@
-"""One rule for rows of poses, whoever reads them: dialects of text, units of length, bad rows."""
+"""One rule for rows of poses, whoever reads them: dialects of text, quaternions, bad rows; and our own
+files read back.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from dataset_writers import (
 )
 
 from taichi_unifusion.datasets import open_dataset
-from taichi_unifusion.errors import DatasetError, PoseError
+from taichi_unifusion.errors import DatasetError, FileError, PoseError
 from taichi_unifusion.files.trajectories import (
     KITTI,
     REPLICA,
@@ -25,10 +27,14 @@ from taichi_unifusion.files.trajectories import (
     read_pose_rows,
     read_stamped_poses,
     read_trajectory,
+    write_trajectory,
 )
+from taichi_unifusion.geometry.quaternions import quaternion_to_rotation
 from taichi_unifusion.tracking.trajectory_files import read_poses
+from taichi_unifusion.types import Trajectory
 
 EXACT = 1e-12  # double arithmetic on numbers near one
+POSE_TOLERANCE = 2e-9  # files hold 9 digits
 SAMPLES = make_samples(3)
 ROWS = [tum_row(sample.T_world_camera, f"{sample.timestamp:.6f}") for sample in SAMPLES]
 
@@ -142,7 +148,7 @@ def test_P6_the_external_tracker_leaves_such_a_pose_out_and_says_so(tmp_path):
     path.write_text("\n".join([ROWS[0], with_length(ROWS[1], 1.1), ROWS[2], ROWS[2]]))
     poses = read_poses(path)
     assert len(poses.keys) == 2
-    assert "2 poses left out" in poses.warnings[0] and "line 2: the quat" in poses.warnings[0]
+    assert "2 of 4 poses left out" in poses.warnings[0] and "line 2: the quat" in poses.warnings[0]
 
 
 @pytest.mark.parametrize("columns", [KITTI, REPLICA])
@@ -181,3 +187,72 @@ def test_a_matrix_that_fills_a_file_in_every_dialect(tmp_path, change):
     path.write_bytes(change(matrix_text(SAMPLES[1].T_world_camera)).encode())
     T = read_pose_file(path).checked()
     np.testing.assert_allclose(T, SAMPLES[1].T_world_camera, rtol=0, atol=EXACT)
+
+
+def make_trajectory(R: np.ndarray) -> Trajectory:
+    poses = np.tile(np.eye(4), (len(R), 1, 1))
+    poses[:, :3, :3] = R
+    poses[:, :3, 3] = np.random.default_rng(1).normal(size=(len(R), 3))
+    return Trajectory(1305031102.175304 + np.arange(len(R)) / 30, poses)
+
+
+def test_trajectory_round_trip(tmp_path):
+    q = np.random.default_rng(0).normal(size=(40, 4))
+    q[:20, 3] = 0  # half turns, where formulas by the trace divide by zero
+    q[:3, :3] = np.eye(3)
+    rotations = quaternion_to_rotation(q)
+    trajectory = make_trajectory(rotations)
+    write_trajectory(tmp_path / "t.txt", trajectory)
+    read = read_trajectory(tmp_path / "t.txt")
+    assert np.array_equal(read.timestamps, trajectory.timestamps)
+    np.testing.assert_allclose(read.T_world_camera, trajectory.T_world_camera, atol=POSE_TOLERANCE)
+    assert (
+        (tmp_path / "t.txt")
+        .read_text()
+        .startswith("# timestamp tx ty tz qx qy qz qw\n1305031102.175304 ")
+    )
+
+
+def test_P7_trajectory_comments_bom_crlf_and_order(tmp_path):
+    (tmp_path / "t.txt").write_bytes(
+        b"\xef\xbb\xbf# a comment\r\n\r\n 2.5  1 2 3  0 0 0 1\r\n1.5\t4 5 6 0 0 0 -1.0005\r\n"
+    )
+    read = read_trajectory(tmp_path / "t.txt")
+    assert read.timestamps.tolist() == [1.5, 2.5]
+    np.testing.assert_allclose(read.T_world_camera[:, :3, 3], [[4, 5, 6], [1, 2, 3]])
+    np.testing.assert_allclose(
+        read.T_world_camera[:, :3, :3], np.tile(np.eye(3), (2, 1, 1)), atol=EXACT
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 2 3", "line 2: expected 8"),
+        ("1 0 0 0 0 0 0 one", "line 2: 'one' is not a number"),
+        ("1 0 0 nan 0 0 0 1", "line 2: holds NaN or infinite"),
+        ("0 0 0 0 0 0 0 1 9", "line 2: expected 8"),
+        ("1 0 0 0 0 0 0 1.1", "line 2: the quaternion's length is 1.1"),
+        ("1 0 0 0 0 0 0 0", "line 2: the quaternion's length is 0.0"),
+    ],
+)
+def test_P6_P7_bad_trajectory_line_is_named(tmp_path, line, message):
+    (tmp_path / "t.txt").write_text(f"0 0 0 0 0 0 0 1\n{line}\n")
+    with pytest.raises(DatasetError, match=message):
+        read_trajectory(tmp_path / "t.txt")
+
+
+def test_trajectory_files_that_are_none(tmp_path):
+    (tmp_path / "empty.txt").write_text("# nothing\n")
+    (tmp_path / "binary.txt").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(DatasetError, match="holds no poses"):
+        read_trajectory(tmp_path / "empty.txt")
+    with pytest.raises(DatasetError, match="not a text file"):
+        read_trajectory(tmp_path / "binary.txt")
+    with pytest.raises(FileError, match="no such file"):
+        read_trajectory(tmp_path / "none.txt")
+    bad = make_trajectory(np.eye(3)[None])
+    bad.T_world_camera[0, :3, :3] *= 1.3
+    with pytest.raises(PoseError, match="pose 0"):
+        write_trajectory(tmp_path / "t.txt", bad)
+    assert not (tmp_path / "t.txt").exists()
