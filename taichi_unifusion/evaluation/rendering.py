@@ -95,23 +95,21 @@ def evaluate_rendering(
             f"rendering: none of {len(scores)} frames has a depth reading in {depth_min:g}..{depth_max:g} m; "
             "is the depth scale wrong?"
         )
-    return RenderingResult(
-        *(_mean([getattr(score, name) for score in scores]) for name in MEANS), scores
-    )
+    means = {name: _mean([getattr(score, name) for score in scores]) for name in MEANS}
+    return RenderingResult(**means, frames=scores)
 
 
 def render_frame(caster: RayCaster, frame: Frame, color: ColorAt | None = None) -> RenderedFrame:
     """What the camera of `frame` would see of the caster's mesh; colour as in `evaluate_rendering`."""
     hits = caster.cast(frame.camera, frame.require_pose())
-    vertex_colors = caster.mesh.attributes.get("color")
-    if color is None and vertex_colors is None:
+    if color is None and "color" not in caster.mesh.attributes:
         return RenderedFrame(hits.depth, None)
     image = np.zeros((*hits.depth.shape, 3), np.float32)
     if hits.hit.any():
         values = (
             color(hits.points(hits.hit))
             if color
-            else caster.interpolate(hits, hits.hit, vertex_colors)
+            else caster.interpolate(hits, hits.hit, caster.mesh.attributes["color"])
         )
         if values.shape[1:] != (3,):
             raise InputError(f"rendering: colours must be (N, 3) RGB in [0, 1], got {values.shape}")

@@ -107,10 +107,10 @@ def evaluate_segmentation(
         )
         for i, label in enumerate(labels.tolist())
     )
-    whole = _group(classes)
+    mean_iou, mean_accuracy = _means(classes)
     return SegmentationResult(
-        whole.mean_iou,
-        whole.mean_accuracy,
+        mean_iou,
+        mean_accuracy,
         float(right.sum() / len(truth)),
         _group([score for score in classes if score.seen]) if unseen else None,
         _group([score for score in classes if not score.seen]),
@@ -144,7 +144,8 @@ def transfer_labels(
     """The label (M,) that each of `targets` (M, 3) takes from the nearest of labelled `points` (N,
     3), all in world [m].
 
-    -1 where none lies within `max_distance` [m]. Raises InputError for points that are not finite or not as many as labels.
+    -1 where none lies within `max_distance` [m]. Raises InputError for points that are not finite
+    or not as many as labels.
     """
     from scipy.spatial import KDTree
 
@@ -161,11 +162,12 @@ def transfer_labels(
 def _group(scores: Collection[ClassScore]) -> GroupScore | None:
     if not scores:
         return None
-    return GroupScore(
-        len(scores),
-        float(np.mean([s.iou for s in scores])),
-        float(np.mean([s.accuracy for s in scores])),
-    )
+    return GroupScore(len(scores), *_means(scores))
+
+
+def _means(scores: Collection[ClassScore]) -> tuple[float, float]:
+    """IoU and accuracy, each class counting once."""
+    return float(np.mean([s.iou for s in scores])), float(np.mean([s.accuracy for s in scores]))
 
 
 def _labels(labels: NDArray, name: str) -> NDArray[np.int64]:

@@ -68,11 +68,14 @@ def evaluate_surface(
     even a perfect mesh fails a threshold of 1 cm.
 
     With `views`, only what those cameras could tell is compared:
-    * a true point counts if a camera saw it: inside the image, in the depth range, nothing of the truth in front of it;
-    * a reconstructed point counts if a camera looked at its place: inside the image, in the depth range, and in front of the
-      true surface on that ray or at most 10 cm behind it. So surface invented in free space, beyond an edge or as a second wall
-      is an error; what lies outside every image, or deeper behind what was seen, is neither right nor wrong;
-    * its distance is to the *whole* true surface, so that what is right is never punished for having been cropped.
+    * a true point counts if a camera saw it: inside the image, in the depth range, nothing of the
+      truth in front of it;
+    * a reconstructed point counts if a camera looked at its place: inside the image, in the depth
+      range, and in front of the true surface on that ray or at most 10 cm behind it. So surface
+      invented in free space, beyond an edge or as a second wall is an error; what lies outside
+      every image, or deeper behind what was seen, is neither right nor wrong;
+    * its distance is to the *whole* true surface, so that correct surface is never counted as wrong
+      because of the crop.
 
     Raises InputError for a mesh that is empty or not finite, for meshes that are nowhere near each
     other, or where the cameras saw nothing of the truth or looked at nothing of the reconstruction.

@@ -34,7 +34,7 @@ def areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
 def vertex_areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
     """Area (V,) [m^2] that each vertex stands for: a third of its triangles'."""
     thirds = np.repeat(areas(vertices, faces) / 3, 3)
-    return np.bincount(faces.ravel(), thirds, len(vertices))
+    return np.asarray(np.bincount(faces.ravel(), thirds, len(vertices)), np.float64)
 
 
 def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray[np.float32]:
@@ -105,16 +105,13 @@ class SurfaceDistance:
         """Distances (N,) to the triangles of so many nearest pieces, and how far the centre of the
         last of these lies.
         """
-        reach, pieces = (
-            found.reshape(len(points), candidates)
-            for found in self.tree.query(points, k=candidates)
-        )
-        triangles = np.sort(self.owner[pieces], axis=1)
+        reach, pieces = self.tree.query(points, k=candidates)
+        reach = np.reshape(np.asarray(reach, np.float64), (len(points), candidates))
+        triangles = np.sort(self.owner[np.reshape(pieces, reach.shape)], axis=1)
         row, column = np.nonzero(np.diff(triangles, axis=1, prepend=-1))  # each triangle once
         squared = squared_distance_to_triangles(points[row], self.corners[triangles[row, column]])
-        return np.sqrt(
-            np.minimum.reduceat(squared, np.searchsorted(row, np.arange(len(points))))
-        ), reach[:, -1]
+        starts = np.searchsorted(row, np.arange(len(points)))
+        return np.sqrt(np.minimum.reduceat(squared, starts)), reach[:, -1]
 
 
 def _pieces(corners: NDArray, area: float) -> tuple[NDArray[np.float64], NDArray[np.int64], float]:

@@ -101,5 +101,5 @@ def _block_mean(values: NDArray, count: int) -> NDArray[np.float32]:
     """Means over `count` runs of rows of (n, ...)."""
     starts = np.arange(count) * len(values) // count
     sums = np.add.reduceat(values.astype(np.float32), starts, axis=0)
-    lengths = np.diff([*starts, len(values)]).astype(np.float32)
-    return sums / lengths.reshape(-1, *[1] * (values.ndim - 1))
+    lengths = np.diff(np.append(starts, len(values))).astype(np.float32)
+    return (sums / lengths.reshape(-1, *[1] * (values.ndim - 1))).astype(np.float32, copy=False)

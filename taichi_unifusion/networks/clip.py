@@ -21,6 +21,7 @@ from ..files.atomic import read_bytes
 from ..types import Frame
 from .encoders import unit_length
 from .image_input import normalized, resized, whole_patches
+from .onnx_session import first_line
 
 NORMALIZATION = {  # model type -> mean and standard deviation of the training images, where the folder does not say
     "clip": ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)),
@@ -56,10 +57,8 @@ class ClipModel:
             )
         except InputError:
             raise
-        except (
-            Exception
-        ) as error:  # OSError, ValueError, and what safetensors and the tokenizers have
-            line = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
+        except Exception as error:  # noqa: BLE001 (OSError, ValueError, and what the tokenizers raise)
+            line = first_line(error)
             hint = "; --download fetches a model of that name from the Hugging Face hub"
             hint = "" if Path(name).exists() or download else hint
             raise FileError(
@@ -183,7 +182,7 @@ class ClipImageEncoder:
         height, width = color.shape[:2]
         h, w = (max(round(CROP_GRID * side / min(height, width)), 1) for side in (height, width))
         windows = [window for share in CROP_SHARES for window in _windows(height, width, share)]
-        total, weights = None, np.full((h, w, 1), 1e-6, np.float32)
+        total, weights = np.float32(0), np.full((h, w, 1), 1e-6, np.float32)
         rows, columns = (np.arange(h) + 0.5) / h * height, (np.arange(w) + 0.5) / w * width
         for first in range(0, len(windows), BATCH):
             batch = windows[first : first + BATCH]
@@ -202,7 +201,7 @@ class ClipImageEncoder:
                 share = np.outer(_tent(rows, y, edge), _tent(columns, x, edge))[..., None].astype(
                     np.float32
                 )
-                total = share * feature if total is None else total + share * feature
+                total = total + share * feature
                 weights += share
         return total / weights
 
@@ -269,8 +268,8 @@ def _normalization(name: str, kind: str) -> tuple[Sequence[float], Sequence[floa
 
 def _import_torch():
     try:
-        import torch
-        import transformers
+        import torch  # pyright: ignore[reportMissingImports]  # optional
+        import transformers  # pyright: ignore[reportMissingImports]  # optional
     except (ImportError, OSError) as error:
         raise MissingDependency(
             f"CLIP is run by transformers and torch: pip install 'taichi-unifusion[clip]' ({error})"

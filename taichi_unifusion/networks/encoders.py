@@ -19,6 +19,7 @@ class ImageEncoder(Protocol):
 
     def image_features(self, frame: Frame) -> NDArray[np.float32]:
         """(h, w, c) at any resolution, unit length; raises FrameError where the frame has none."""
+        ...
 
 
 class TextEncoder(Protocol):
@@ -28,6 +29,7 @@ class TextEncoder(Protocol):
 
     def text_features(self, texts: Sequence[str]) -> NDArray[np.float32]:
         """(n, c), unit length; raises InputError for a text that it has no vector for."""
+        ...
 
 
 def feature_image(encoder: ImageEncoder, frame: Frame) -> NDArray[np.float32]:

@@ -43,10 +43,9 @@ def signature_saliency() -> SurfaceProperty:
         # even, as the transform needs it
         size = max(4, round(width * half)) * 2, max(4, round(height * half)) * 2
         small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
-        lab = cv2.cvtColor(np.float32(small) / 255, cv2.COLOR_RGB2Lab)
-        salient = cv2.GaussianBlur(
-            sum(signature_energy(channel) for channel in cv2.split(lab)), None, BLUR
-        )
+        lab = cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
+        energy = np.sum([signature_energy(channel) for channel in cv2.split(lab)], axis=0)
+        salient = np.asarray(cv2.GaussianBlur(energy, (0, 0), BLUR))
         salient -= salient.min()
         salient /= max(float(np.percentile(salient, BRIGHTEST)), 1e-12)
         return np.clip(cv2.resize(salient, (width, height), interpolation=cv2.INTER_CUBIC), 0, 1)
@@ -54,7 +53,7 @@ def signature_saliency() -> SurfaceProperty:
     return SurfaceProperty("saliency", 1, function, LOOK)
 
 
-def signature_energy(channel: NDArray[np.float32]) -> NDArray[np.float32]:
+def signature_energy(channel: NDArray) -> NDArray:
     """Energy (H, W) of what is left of an image when only the signs of its cosine transform are
     kept.
     """
@@ -89,7 +88,7 @@ def network_saliency(
         color = color_of(frame)
         values = network(normalized(color, mean, std, scale, order), color.shape[:2])[..., 0]
         if activation == "sigmoid":
-            return 1 / (1 + np.exp(-np.clip(values, -60, 60)))
+            return (1 / (1 + np.exp(-np.clip(values, -60, 60)))).astype(np.float32)
         low, high = float(values.min()), float(values.max())
         if activation == "minmax":
             return (values - low) / max(high - low, 1e-12)

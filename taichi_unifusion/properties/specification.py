@@ -25,7 +25,6 @@ from ..maps.settings import PropertySettings
 from . import PROPERTIES
 from .base import SurfaceProperty
 
-NAME = re.compile(r"([^=,]*)(?:[=,](.*))?", re.DOTALL)
 OPTION = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)=(.*)", re.DOTALL)
 
 
@@ -37,7 +36,7 @@ def make_property(text: str, settings: PropertySettings | None = None) -> Surfac
     that does not fit, and whatever making it raises: FileError for a model that is missing,
     MissingDependency for a package.
     """
-    name, rest = NAME.fullmatch(text).groups(default="")
+    name, rest = [*re.split("[=,]", text, maxsplit=1), ""][:2]
     methods = PROPERTIES.get(name)
     if methods is None:
         raise InputError(

@@ -38,11 +38,14 @@ def painting_style(
         flat = cv2.edgePreservingFilter(
             color_of(frame), flags=cv2.RECURS_FILTER, sigma_s=smoothness, sigma_r=detail
         )
-        flat = np.float32(flat) / 255
-        soft = cv2.GaussianBlur(flat, None, CONTOUR_WIDTH)
-        # a pixel
-        slopes = (cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (0, 1))
-        strength = np.sqrt(sum(slope**2 for slope in slopes).max(axis=2, keepdims=True))
+        flat = flat.astype(np.float32) / 255
+        soft = cv2.GaussianBlur(flat, (0, 0), CONTOUR_WIDTH)
+        # change a pixel along rows and columns
+        down, right = (
+            np.asarray(cv2.Sobel(soft, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8))
+            for dx in (0, 1)
+        )
+        strength = np.sqrt((down**2 + right**2).max(axis=2, keepdims=True))
         return flat * (1 - np.clip(contours * (strength - FAINTEST), 0, 1))
 
     return SurfaceProperty("style", 3, function, LOOK)
@@ -125,11 +128,11 @@ def network_style(
 
 
 def _bgr_of(frame: Frame) -> NDArray[np.uint8]:
-    return cv2.cvtColor(color_of(frame), cv2.COLOR_RGB2BGR)
+    return np.ascontiguousarray(color_of(frame)[..., ::-1])
 
 
-def _as_rgb(bgr: NDArray[np.uint8]) -> NDArray[np.float32]:
-    return np.float32(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)) / 255
+def _as_rgb(bgr: NDArray) -> NDArray[np.float32]:
+    return np.asarray(bgr[..., ::-1], np.float32) / np.float32(255)
 
 
 def _check_filter(smoothness: float, detail: float) -> None:

@@ -47,10 +47,11 @@ class Look:
 def color_table(name: str) -> NDArray[np.float32]:
     """The colour map as (256, 3) RGB in [0, 1]."""
     steps = np.arange(256, dtype=np.uint8)[:, None]
-    if COLORMAPS[name] is not None:
-        return np.float32(cv2.applyColorMap(steps, COLORMAPS[name])[:, 0, ::-1] / 255)
+    number = COLORMAPS[name]
+    if number is not None:
+        return (cv2.applyColorMap(steps, number)[:, 0, ::-1] / 255).astype(np.float32)
     if name == "gray":
-        return np.float32(np.repeat(steps, 3, axis=1) / 255)
+        return (np.repeat(steps, 3, axis=1) / 255).astype(np.float32)
     lab = np.stack(
         [
             np.interp(steps[:, 0], (0, 127.5, 255), ends)
@@ -58,7 +59,7 @@ def color_table(name: str) -> NDArray[np.float32]:
         ],
         axis=1,
     )
-    return np.clip(cv2.cvtColor(np.float32(lab)[None], cv2.COLOR_Lab2RGB)[0], 0, 1)
+    return np.clip(cv2.cvtColor(lab.astype(np.float32)[None], cv2.COLOR_Lab2RGB)[0], 0, 1)
 
 
 def colorize(values: NDArray, colormap: str, low: float, high: float) -> NDArray[np.float32]:

@@ -125,10 +125,10 @@ def _drawable(mesh: Mesh) -> _Drawable:
         raise InputError(
             f"preview: the faces name vertices {faces.min()}..{faces.max()}, but the mesh has {len(vertices)}"
         )
-    finite = np.isfinite(vertices).all(axis=1)
-    if not finite.all():
-        faces = np.ascontiguousarray(faces[finite[faces].all(axis=1)])
-        vertices = np.where(finite[:, None], vertices, np.float32(0))
+    bad = ~np.isfinite(vertices)
+    if bad.any():
+        faces = np.ascontiguousarray(faces[~bad[faces].any(axis=(1, 2))])
+        vertices = np.where(bad.any(axis=1, keepdims=True), np.float32(0), vertices)
     if not len(faces):
         raise InputError("preview: the mesh is empty, there is nothing to draw")
     normals = (

@@ -37,8 +37,9 @@ def rotation(axis: int, degrees: float) -> NDArray[np.float64]:
 
 def box(material: str, low: Sequence[float], high: Sequence[float]) -> Primitive:
     """The box between two corners [m]."""
-    low, high = np.array(low, dtype=float), np.array(high, dtype=float)
-    return Primitive(BOX, material, (low + high) / 2, (high - low) / 2, np.eye(3))
+    corners = np.array([low, high], dtype=float)
+    half_extents = (corners[1] - corners[0]) / 2
+    return Primitive(BOX, material, corners.sum(axis=0) / 2, half_extents, np.eye(3))
 
 
 def cylinder(
@@ -56,7 +57,10 @@ def cylinder(
 
 
 def ellipsoid(
-    material: str, center: Sequence[float], radii: Sequence[float], R: NDArray | None = None
+    material: str,
+    center: Sequence[float] | NDArray,
+    radii: Sequence[float],
+    R: NDArray | None = None,
 ) -> Primitive:
     """The ellipsoid with these half axes [m]."""
     R = np.eye(3) if R is None else R

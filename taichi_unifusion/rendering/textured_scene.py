@@ -176,7 +176,8 @@ def mip_levels(texture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
     levels = [texture]
     while max(levels[-1].shape[:2]) > 1:
         height, width = (max(1, size // 2) for size in levels[-1].shape[:2])
-        levels.append(cv2.resize(levels[-1], (width, height), interpolation=cv2.INTER_AREA))
+        smaller = cv2.resize(levels[-1], (width, height), interpolation=cv2.INTER_AREA)
+        levels.append(np.asarray(smaller, np.uint8))
     return levels
 
 
@@ -194,8 +195,8 @@ def load_scene(path: str | Path) -> TexturedScene:
             f"{path}: reading a scene needs trimesh: pip install trimesh"
         ) from None
     try:
-        scene = trimesh.load(str(path), force="scene", process=False)
-        # in an order of no chance
+        scene: Any = trimesh.load(str(path), force="scene", process=False)
+        # sorted: the same order in every run
         placed = [(name, *scene.graph[name]) for name in sorted(scene.graph.nodes_geometry)]
         parts = [
             (name, T, scene.geometry[key])

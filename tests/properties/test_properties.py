@@ -45,7 +45,7 @@ def noise() -> np.ndarray:
     return np.uint8(125 + 35 * np.clip(grain / grain.std(), -1, 1))
 
 
-# --- Infrared -------------------------------------------------------------------------------------------------------
+# ---- Infrared ----
 
 
 def test_infrared_is_a_rising_curve_that_can_be_undone():
@@ -125,7 +125,7 @@ def test_infrared_that_is_no_grey_picture_costs_its_frame(tmp_path):
         open_dataset("folder", folder)[0]
 
 
-# --- Saliency and style without weights ------------------------------------------------------------------------------
+# ---- Saliency and style without weights ----
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_what_is_made_from_colour_says_where_there_is_none(text):
         make_property(text).image(frame_of())
 
 
-# --- Properties of depth ----------------------------------------------------------------------------------------------
+# ---- Properties of depth ----
 
 
 def rays() -> np.ndarray:
@@ -221,7 +221,7 @@ def test_curvature_of_a_sphere_is_one_by_its_radius(side):
     assert abs(np.nanmedian(bend) - side / radius) < CURVED / radius
 
 
-# --- Images from a folder ---------------------------------------------------------------------------------------------
+# ---- Images from a folder ----
 
 
 def test_images_are_found_by_name_or_number(tmp_path, noise):
@@ -260,7 +260,7 @@ def test_a_folder_without_images_is_said(tmp_path):
         make_property(f"images={tmp_path}")
 
 
-# --- Properties as text -------------------------------------------------------------------------------------------------
+# ---- Properties as text ----
 
 
 def test_text_names_method_options_and_settings_of_the_map():
@@ -341,7 +341,7 @@ def test_every_method_can_be_made(tmp_path):
                 assert isinstance(make_property(text), SurfaceProperty)
 
 
-# --- A function of one's own --------------------------------------------------------------------------------------------
+# ---- A function of one's own ----
 
 
 def test_a_function_is_checked_at_every_frame():
@@ -392,7 +392,7 @@ def test_a_property_is_checked_when_it_is_made(values, told):
         )
 
 
-# --- Colours ------------------------------------------------------------------------------------------------------------
+# ---- Colours ----
 
 
 @pytest.mark.parametrize("name", COLORMAPS)
