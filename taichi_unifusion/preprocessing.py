@@ -13,7 +13,7 @@ from . import runtime
 from .errors import InputError
 from .types import Frame, ImageView, PointCloud
 
-FARTHEST = 1e4  # [m] readings beyond are none
+FARTHEST = 1e4  # [m] readings beyond it are dropped
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
 
 
 def _view(frame: Frame, settings: PreprocessSettings) -> ImageView:
-    """All of a frame's readings: those that are too far for a point still say that space before
-    them is free.
+    """All readings of a frame: those too far for a point still show that the space in front of them
+    is free.
     """
     from .kernels import images as kernels
 

@@ -19,7 +19,7 @@ from .types import Frame, Trajectory
 
 logger = logging.getLogger(__name__)
 
-POSE_PAIRS = 5  # frames that may overlap too little to tell how poses are meant
+POSE_PAIRS = 5  # pairs of frames to try before giving up on checking the pose convention
 
 
 class EmptyFrame(FrameError):
@@ -71,7 +71,9 @@ class RunResult:
 
 
 class RunLog:
-    """Collects what becomes a RunResult; says the first of every kind of trouble at once."""
+    """Collects a RunResult while frames are processed; warns at once of the first of every kind of
+    trouble.
+    """
 
     def __init__(self, sequence: Sequence[Frame]) -> None:
         self.sequence, self.name = sequence, getattr(sequence, "name", "sequence")
@@ -82,8 +84,8 @@ class RunLog:
         self.poses: list[tuple[float | None, np.ndarray]] = []  # time stamp, T_world_camera
         self.warnings: list[str] = []
         self.scale_checked = self.color_missing = False
-        self.reference: Frame | None = None  # with which poses are checked
-        self.pose_pairs = POSE_PAIRS  # left to check them with
+        self.reference: Frame | None = None  # frame that later ones are checked against
+        self.pose_pairs = POSE_PAIRS  # pairs still to try
         for sentence in getattr(sequence, "warnings", ()):
             self.warn(sentence)
 
@@ -101,7 +103,7 @@ class RunLog:
             self.warn(f"{frame.label}: {guess}")
 
     def check_poses(self, frame: Frame) -> None:
-        """Warn if an early pair of frames says that the poses are to be read in another way."""
+        """Warn if an early pair of frames shows that the poses follow another convention."""
         if self.pose_pairs == 0:
             return
         if self.reference is None or not has_moved(self.reference, frame):

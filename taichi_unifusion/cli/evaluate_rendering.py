@@ -97,6 +97,8 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     run = find_run(options.reconstruction)
     mesh = run.mesh() if run else read_any_mesh(options.reconstruction)
     recording, run = _recording(options, run)
+    for sentence in recording.warnings:
+        logger.warning("%s", sentence)
     chosen = choose_frames(options, run, recording)
     limits = run.config().preprocess if run else Config().preprocess
     runtime.init(options.device)

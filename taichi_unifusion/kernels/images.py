@@ -1,7 +1,7 @@
 """Preprocessing on the image grid, and rigid motion.
 
-Every input is real somewhere: readings are tested by their bits, because the compiler may assume
-that there is no NaN.
+Real depth holds NaN, infinity and negatives; they are recognised by their bits, because fast math
+may drop a test for NaN.
 """
 
 import taichi as ti
@@ -16,7 +16,7 @@ PIXEL_CHUNK = 64  # pixels that one thread compacts
 @ti.kernel
 def clip_depth(
     # in:
-    depth: Floats2,  # (H, W) [m], anything
+    depth: Floats2,  # (H, W) [m], with any values
     depth_min: ti.f32,
     depth_max: ti.f32,
     # out:
@@ -33,10 +33,10 @@ def clip_depth(
 def drop_flying_pixels(
     # in:
     depth: Floats2,  # (H, W) [m], 0: none
-    jump: ti.f32,  # pixels whose depths differ by less than this share belong together
-    support: ti.i32,  # of its 8 neighbours, so many must belong together with a pixel
+    jump: ti.f32,  # pixels whose depths differ by at most this share lie on one surface
+    support: ti.i32,  # how many of its 8 neighbours must lie on a pixel's surface
     # out:
-    inverse: Floats2,  # (H, W) [1/m], 0 where there is no reading or a pixel hangs between surfaces
+    inverse: Floats2,  # (H, W) [1/m], 0 where there is no reading or a flying pixel
 ):
     height, width = depth.shape[0], depth.shape[1]
     for v, u in depth:
@@ -53,8 +53,8 @@ def drop_flying_pixels(
 def inverse_depth_slope(
     inverse: ti.template(), v: ti.i32, u: ti.i32, radius: ti.template(), jump: ti.f32
 ):
-    """Least-squares slopes of 1/z by u and v over a window, from pairs of pixels opposite to (v, u)
-    that belong with it.
+    """Least-squares slopes of 1/z by u and v over a window, from pairs of pixels on opposite sides
+    of (v, u) and on its surface.
 
     A plane has an inverse depth that is linear in the image. Also returns the smaller sum of
     squares of the two fits.
@@ -91,8 +91,8 @@ def estimate_normals(
     inverse: Floats2,  # (H, W) 1/z [1/m], 0: none
     K: Intrinsics,
     radius: ti.template(),  # of the window [pixels]
-    jump: ti.f32,
-    cos_max_angle: ti.f32,  # between the normal and the ray back to the camera
+    jump: ti.f32,  # as in drop_flying_pixels
+    cos_max_angle: ti.f32,  # least cosine between the normal and the ray back to the camera
     # out:
     normals: Floats3,  # (H, W, 3) unit, towards the camera; z component 0 where there is none
 ):

@@ -1,10 +1,10 @@
 """Colored ICP on image pyramids: surfel images, and the 6x6 normal equations of one Gauss-Newton
 step (Sec. V-A.1).
 
-A *surfel image* holds in every pixel what registration asks of it, side by side in memory: depth,
-normal, intensity and its slopes. Association is projective: a source pixel's point, moved into the
-target camera, meets the pixel that it falls in. Every block of source rows keeps sums of its own,
-so that the result does not depend on the order in which threads run.
+A *surfel image* holds what registration reads of every pixel side by side in memory: depth, normal,
+intensity and its slopes. Association is projective: a source pixel's point, moved into the target
+camera, is paired with the pixel that it falls in. Every block of source rows has sums of its own, so
+that the result does not depend on the order in which threads run.
 """
 
 import taichi as ti
@@ -21,16 +21,17 @@ CHUNK = 512  # iterations that a CPU thread takes at a time
 # Columns of the sums: the upper triangle of H row by row, b, then these.
 H_SIZE, B_SIZE = 21, 6
 SOURCE = H_SIZE + B_SIZE  # source surfels
-IN_VIEW = SOURCE + 1  # of them, those that meet a target surfel
-INLIERS = SOURCE + 2  # of them, those near its plane with a like normal
+IN_VIEW = SOURCE + 1  # those of them that are paired with a target surfel
+INLIERS = SOURCE + 2  # those of them that lie near its plane and have a similar normal
 SQUARED_DISTANCE = SOURCE + 3  # of the inliers [m^2]
 COLORED = SOURCE + 4  # inliers whose intensity counts
 PHOTOMETRIC_SCALE = SOURCE + 5  # their weighted squared residuals
 SUMS = SOURCE + 6
-FREEDOM = 5.0  # of the t distribution of intensity residuals (Kerl et al. 2013)
-# [1/px] of intensity: what is flatter is mostly noise, which would pass for texture on a blank wall
+FREEDOM = 5.0  # degrees of freedom of the residuals' t distribution (Kerl et al. 2013)
+# [1/px] smallest slope of intensity that counts; flatter ones are mostly noise, which would look like
+# texture on a blank wall
 LEAST_SLOPE = 0.012
-NEAR = 0.05  # [m] what lies nearer to the target camera is not projected
+NEAR = 0.05  # [m] points nearer to the target camera are not projected
 
 
 @ti.kernel

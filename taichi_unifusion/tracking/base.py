@@ -1,4 +1,4 @@
-"""What every tracker is, and what it says about a frame: frozen values (Sec. V-A.1)."""
+"""What every tracker is, its settings, and what it returns (Sec. V-A.1)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TrackingSettings:
     window: int = 1
     """How many recent keyframes a frame is aligned to; internal tracking uses at least 3."""
     loops: bool = True
-    """Recognise places seen before, and distribute what was drifted over the trajectory."""
+    """Recognise places seen before, and distribute the drift over the trajectory."""
     prior_distance: float = 0.10
     """internal: a refinement that moves a pose further than this from the given one, in metres, is
     not trusted ...
@@ -87,7 +87,7 @@ class TrackedFrame:
     timestamp: float | None = None  # [s]
     fitness: float | None = None  # share of its surfels that lie on what it was aligned to
     rmse: float | None = None  # of their distances [m]
-    keyframe: int | None = None  # index of the frame that it was aligned to
+    keyframe: int | None = None  # place in the recording of the frame that it was aligned to
     message: str = ""  # why a pose is missing or not trusted
 
 
@@ -134,9 +134,9 @@ class PoseSource:
 class Tracker(ABC):
     """Poses for frames that come in order: `track` each of them, then `finish` once.
 
-    A tracker for another source of poses (a SLAM system, a ROS topic) is one more class like this
-    one, and a line in `TRACKERS`. `warnings` holds sentences on what was odd but usable; they are
-    said when tracking starts.
+    A tracker for another source of poses (a SLAM system, a ROS topic) is one more subclass, and a
+    line in `TRACKERS`. `warnings` holds sentences on what was odd but usable; `track_sequence` says
+    them when it starts.
     """
 
     uses_given_poses = True  # False: frames are handed over without the poses of their recording

@@ -68,7 +68,9 @@ def extract_features(frame: Frame, depth_min: float, depth_max: float) -> Featur
     order = np.argsort([-corner.response for corner in corners], kind="stable")
     order = order[seen[order]]
     points = camera.rays(*pixels[order].T) * z[order, None]
-    return Features(np.uint8(descriptors[order]), pixels[order], points.astype(np.float32), camera)
+    return Features(
+        np.asarray(descriptors[order], np.uint8), pixels[order], points.astype(np.float32), camera
+    )
 
 
 def most_similar(query: Features, others: Sequence[Features], count: int) -> list[int]:

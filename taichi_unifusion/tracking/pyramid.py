@@ -15,7 +15,7 @@ from ..types import Frame, PinholeCamera
 FINEST_WIDTH = 320
 SMALLEST = 24  # [px] least shorter side of a level
 NORMAL_RADIUS = (3, 2, 2)  # [px] by level, finest first
-# as in preprocessing; the jump is for images of FINEST_WIDTH or more
+# what PreprocessSettings calls edge_jump and edge_support; the jump in images of FINEST_WIDTH or more
 EDGE_JUMP, EDGE_SUPPORT = 0.03, 5
 MAX_ANGLE = 80.0  # [degrees] between ray and normal
 
