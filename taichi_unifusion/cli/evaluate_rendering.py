@@ -205,13 +205,11 @@ def _usable(
     for done, index in enumerate(chosen, start=1):
         try:
             frame = recording[index]
+            T_run_camera = T_run_recording @ frame.require_pose()
         except FrameError as error:
             logger.warning("frame left out: %s", error)
-            frame = None
-        if frame is not None and frame.T_world_camera is None:
-            logger.warning("frame left out: %s: there is no pose for it", frame.name or index)
-        elif frame is not None:
-            yield replace(frame, T_world_camera=T_run_recording @ frame.T_world_camera)
+        else:
+            yield replace(frame, T_world_camera=T_run_camera)
         on_frame(done, len(chosen))
 
 

@@ -334,6 +334,7 @@ def test_rendering_leaves_out_frames_that_cannot_be_used(results, recording, cap
     captured = capsys.readouterr()
     assert [frame["index"] for frame in json.loads(captured.out)["frames"]] == [4]
     assert captured.err.count("frame left out") == 2 and "1.png" in captured.err
+    assert "frames have no usable pose and will be skipped (first: " in captured.err
 
 
 def test_rendering_table(results, capsys):
