@@ -18,6 +18,7 @@ from ..rendering.look import Look, shown_range
 from ..run_log import RunResult, StepResult
 from ..types import Mesh
 from .folder_writer import FolderWriter
+from .property_files import looks_of
 from .record import (
     FrameCounts,
     MapRecord,
@@ -64,7 +65,7 @@ def measure_run(
             for name, target in pipeline.maps.items()
         },
         properties={
-            name: _shown(mesh, name, source.look, run) for name, source in pipeline.sources.items()
+            name: _shown(mesh, name, look, run) for name, look in looks_of(pipeline).items()
         },
         mesh=None if mesh is None else MeshRecord(len(mesh.vertices), len(mesh.faces)),
         # Linux counts KiB

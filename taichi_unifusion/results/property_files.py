@@ -10,6 +10,8 @@ import numpy as np
 
 from ..errors import FileError, InputError
 from ..files.images import write_png
+from ..pipeline import Pipeline
+from ..properties import SurfaceProperty
 from ..rendering.legend import draw_legend, property_mesh
 from ..rendering.look import Look, shown_range
 from ..rendering.preview import draw_preview
@@ -18,6 +20,15 @@ from .record import PropertyRecord, read_record
 from .run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
+
+
+def looks_of(pipeline: Pipeline) -> dict[str, Look]:
+    """How the mesh is coloured by each property that it carries, by name."""
+    return {
+        name: source.look
+        for name, source in pipeline.sources.items()
+        if isinstance(source, SurfaceProperty)  # other sources give vertices no values
+    }
 
 
 def property_meshes(folder: RunFolder, mesh: Mesh) -> dict[Path, Mesh]:

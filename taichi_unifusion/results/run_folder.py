@@ -54,6 +54,11 @@ class RunFolder:
         return {path.stem: path for path in sorted(self.map_folder.glob(self.map("*").name))}
 
     @property
+    def features(self) -> Path:
+        """The map of image-text features, which questions are put to."""
+        return self.map("features")
+
+    @property
     def mesh(self) -> Path:
         """The mesh with everything that the maps know of its vertices."""
         return self.mesh_file("ply")

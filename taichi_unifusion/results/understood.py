@@ -10,7 +10,6 @@ from ..errors import FileError, InputError
 from ..files.mesh_reading import read_mesh
 from ..files.trajectories import read_trajectory
 from ..maps import LatentMap
-from ..pipeline import FEATURES
 from ..types import Mesh, Trajectory
 from .run_folder import RunFolder
 
@@ -29,10 +28,10 @@ def read_understood(directory: Path, device: str) -> Understood:
     missing or damaged.
     """
     folder = RunFolder(directory)
-    file = folder.map(FEATURES)
-    if not file.exists():
+    if not folder.features.exists():
         raise FileError(
-            f"{directory}: no {folder.relative(file)} here; give the results folder of `unifusion understand`"
+            f"{directory}: no {folder.relative(folder.features)} here; give the results folder of "
+            "`unifusion understand`"
         )
     if not folder.mesh.exists():
         raise FileError(
@@ -44,5 +43,5 @@ def read_understood(directory: Path, device: str) -> Understood:
     runtime.init(device)
     poses = folder.trajectory
     return Understood(
-        mesh, LatentMap.load(file), read_trajectory(poses) if poses.exists() else None
+        mesh, LatentMap.load(folder.features), read_trajectory(poses) if poses.exists() else None
     )

@@ -25,7 +25,7 @@ from ..run_log import RunResult
 from ..types import Mesh
 from .folder_writer import FolderWriter
 from .measure import measure_run
-from .property_files import write_property_picture
+from .property_files import looks_of, write_property_picture
 from .record import RunRecord, Seconds, Source, write_record
 from .run_folder import MESH_SUFFIXES, RunFolder
 
@@ -86,8 +86,8 @@ def write_results(
     extracted = time.perf_counter()
     if mesh is not None:
         _write_mesh_files(writer, mesh, pipeline, run)
-        for name, source in pipeline.sources.items():
-            _write_property(writer, mesh, name, source.look, pipeline, run)
+        for name, look in looks_of(pipeline).items():
+            _write_property(writer, mesh, name, look, pipeline, run)
     if not writer.failures:
         _remove_others(writer, pipeline)
     seconds = Seconds(
@@ -101,9 +101,7 @@ def write_results(
 
 
 def _write_maps(writer: FolderWriter, pipeline: Pipeline, run: RunResult) -> None:
-    """Every map; one that no frame gave anything for is a failure, unless its property says so
-    later, of the mesh.
-    """
+    """Write every map; one that was never made, since no frame gave its values, is a failure."""
     for name, made in pipeline.maps.items():
         writer.write(writer.folder.map(name), made.save)
     for name, reason in _first_lacking(run).items():

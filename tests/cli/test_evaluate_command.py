@@ -346,7 +346,7 @@ def test_rendering_table(results, capsys):
     )
 
 
-# --- Runs whose poses were tracked --------------------------------------------------------------------------------------
+# --- Runs whose poses were tracked ----------------------------------------------------------------------------------
 
 
 def test_a_tracked_run_is_fitted_to_the_recording(results, truth, evaluate, tmp_path, caplog):
