@@ -68,6 +68,32 @@ def open_tum(
             "groundtruth.txt"
         )
     warnings: list[str] = []
+    depth, color = _paired_images(path, max_difference, warnings)
+    truth = path / "groundtruth.txt"
+    poses = (
+        _poses_for(depth, truth, max_difference, warnings)
+        if truth.exists()
+        else [None] * len(depth)
+    )
+    frames = [
+        FrameFiles(image.value, partner.value, pose, image.timestamp)
+        for image, partner, pose in zip(depth, color, poses, strict=True)
+    ]
+    return Recording(
+        f"tum {path}",
+        frames,
+        _camera(path, frames, camera, warnings),
+        DEPTH_SCALE if depth_scale is None else depth_scale,
+        drop_alpha=drop_alpha,
+        warnings=warnings,
+        no_poses="" if truth.exists() else f"{truth}: no such file",
+    )
+
+
+def _paired_images(
+    path: Path, max_difference: float, warnings: list[str]
+) -> tuple[list[Stamped[Path]], list[Stamped[Path]]]:
+    """Depth images and the colour image of each; what is left out is added to `warnings`."""
     color = _in_time_order(_read_image_list(path / "rgb.txt"), warnings)
     depth = _in_time_order(_read_image_list(path / "depth.txt"), warnings)
     pairs = associate(_stamps(depth), _stamps(color), max_difference)
@@ -81,26 +107,7 @@ def open_tum(
         warnings.append(
             f"{alone[0]} colour and {alone[1]} depth images have no partner within {max_difference} s, left out"
         )
-    depth = [depth[i] for i, _ in pairs]
-    truth = path / "groundtruth.txt"
-    poses = (
-        _poses_for(depth, truth, max_difference, warnings)
-        if truth.exists()
-        else [None] * len(depth)
-    )
-    frames = [
-        FrameFiles(image.value, color[j].value, pose, image.timestamp)
-        for image, (_, j), pose in zip(depth, pairs, poses, strict=True)
-    ]
-    return Recording(
-        f"tum {path}",
-        frames,
-        _camera(path, frames, camera, warnings),
-        DEPTH_SCALE if depth_scale is None else depth_scale,
-        drop_alpha=drop_alpha,
-        warnings=warnings,
-        no_poses="" if truth.exists() else f"{truth}: no such file",
-    )
+    return [depth[i] for i, _ in pairs], [color[j] for _, j in pairs]
 
 
 def _read_image_list(file: Path) -> list[Stamped[Path]]:

@@ -111,7 +111,7 @@ def _slices(
 def _open_torch(path: Path) -> Any:
     """The one tensor in a file of torch."""
     try:
-        import torch
+        import torch  # pyright: ignore[reportMissingImports] - an extra, often not installed
     except ImportError:
         raise MissingDependency(
             f"{path}: .pt files are read by torch: pip install 'taichi-unifusion[clip]', or save "

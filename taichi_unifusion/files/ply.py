@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 
+# type in the file, names of the properties, values (V, number of names)
+Column = tuple[str, tuple[str, ...], NDArray[Any]]
+
 
 class Triangles(Protocol):
     """What can be written: `types.Mesh`, or anything with its fields."""
@@ -42,34 +45,7 @@ def write_ply(file: BinaryIO, mesh: Triangles) -> None:
     a comment in the header says which, so that reading gives the same attributes. Raises InputError
     for names that PLY cannot hold.
     """
-    columns: list[tuple[str, tuple[str, ...], NDArray[Any]]] = [
-        ("<f4", ("x", "y", "z"), mesh.vertices)
-    ]
-    if mesh.normals is not None:
-        columns.append(("<f4", ("nx", "ny", "nz"), mesh.normals))
-    comments = []
-    for name, values in mesh.attributes.items():
-        if values.ndim != 2:
-            raise InputError(f"mesh: attribute '{name}' must be (V, c), got {values.shape}")
-        if name == "color":
-            if values.shape[1] != 3:
-                raise InputError(
-                    f"mesh: attribute 'color' must be (V, 3) RGB in [0, 1], got {values.shape}"
-                )
-            columns.append(("u1", ("red", "green", "blue"), color_to_uint8(values)))
-            continue
-        if not re.fullmatch(r"[!-~]+", name):
-            raise InputError(
-                f"mesh: attribute '{name}' cannot be named so in a PLY file; use letters, digits and _"
-            )
-        comments.append(f"comment attribute {name} {values.shape[1]}")
-        columns.append(("<f4", property_names(name, values.shape[1]), values))
-    names = [name for _, group, _ in columns for name in group]
-    if len(set(names)) != len(names):
-        raise InputError(
-            f"mesh: two attributes would share a PLY property name among {', '.join(names)}; rename one"
-        )
-
+    columns, comments = _columns_of(mesh)
     rows = np.empty(
         len(mesh.vertices), [(name, kind) for kind, group, _ in columns for name in group]
     )
@@ -94,6 +70,36 @@ def write_ply(file: BinaryIO, mesh: Triangles) -> None:
     for table in (rows, triangles):
         if len(table):
             file.write(table.view(np.uint8).data)
+
+
+def _columns_of(mesh: Triangles) -> tuple[list[Column], list[str]]:
+    """The vertices' columns, and header comments that say which of them form an attribute."""
+    columns: list[Column] = [("<f4", ("x", "y", "z"), mesh.vertices)]
+    if mesh.normals is not None:
+        columns.append(("<f4", ("nx", "ny", "nz"), mesh.normals))
+    comments = []
+    for name, values in mesh.attributes.items():
+        if values.ndim != 2:
+            raise InputError(f"mesh: attribute '{name}' must be (V, c), got {values.shape}")
+        if name == "color":
+            if values.shape[1] != 3:
+                raise InputError(
+                    f"mesh: attribute 'color' must be (V, 3) RGB in [0, 1], got {values.shape}"
+                )
+            columns.append(("u1", ("red", "green", "blue"), color_to_uint8(values)))
+            continue
+        if not re.fullmatch(r"[!-~]+", name):
+            raise InputError(
+                f"mesh: attribute '{name}' cannot be named so in a PLY file; use letters, digits and _"
+            )
+        comments.append(f"comment attribute {name} {values.shape[1]}")
+        columns.append(("<f4", property_names(name, values.shape[1]), values))
+    names = [name for _, group, _ in columns for name in group]
+    if len(set(names)) != len(names):
+        raise InputError(
+            f"mesh: two attributes would share a PLY property name among {', '.join(names)}; rename one"
+        )
+    return columns, comments
 
 
 def property_names(name: str, columns: int) -> tuple[str, ...]:
