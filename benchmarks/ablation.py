@@ -26,7 +26,7 @@ from quality_scenes import DEPTH_RANGE, SCENES, Scene
 import taichi_unifusion as uf
 from taichi_unifusion.evaluation import Viewpoints, evaluate_rendering, evaluate_surface
 from taichi_unifusion.maps.encoding import EncoderSettings, PositionEncoding
-from taichi_unifusion.rendering.preview import Viewpoint, render_mesh
+from taichi_unifusion.rendering.drawing import Viewpoint, render_mesh
 from taichi_unifusion.types import Mesh
 
 VOXEL_SIZES = (0.02, 0.03, 0.05, 0.07, 0.10)  # [m]

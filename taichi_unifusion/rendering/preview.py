@@ -1,4 +1,6 @@
-"""A picture of a coloured mesh, drawn in software: no GPU, no graphics library, no screen."""
+"""A picture of a coloured mesh from well-chosen viewpoints, drawn in software: no GPU, no graphics
+library, no screen.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +14,15 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, check_choice
 from ..files.images import write_png
-from ..geometry.triangles import area_vectors, vertex_normals
+from ..geometry.triangles import area_vectors
 from ..types import Mesh, PinholeCamera, Trajectory, check_rigid
-from .depth_buffer import DepthBuffer, draw_depth_buffer
+from .drawing import Drawable, Viewpoint
 
 VIEWS = {  # name -> what it shows
     "camera": "from a camera of the recording, drawn back a little",
     "overview": "from above, walls and ceilings that face away left out",
     "opposite": "the overview from another side",
 }
-BACKGROUND = (0.965, 0.97, 0.975)
-GREY = 0.78  # of a mesh without colour
-# how much light changes the colours of a mesh with and without colour
-SHADING = {True: 0.22, False: 0.6}
-# towards it in the camera frame: above, a little left, behind the camera
-LIGHT = (-0.35, -0.75, -0.55)
-OCCLUSION_RADIUS = 0.25  # [m] of ambient occlusion
-OCCLUSION_TAPS = 4  # per sample; the four samples of a pixel look in different directions
-SAMPLES = 2  # per pixel and axis
-
 # vertical; wider than what a camera records, to count its surroundings too
 JUDGED_FOV = math.radians(55)
 CANDIDATES = 12  # recorded cameras, evenly over the recording, to choose one from
@@ -43,15 +35,6 @@ AZIMUTHS = 24
 MARGIN = 1.04  # of the picture around what is fitted into it
 # share of the surface that may lie outside each side, so that specks do not shrink the rest
 STRAY = 0.002
-
-
-@dataclass(frozen=True)
-class Viewpoint:
-    """A camera that looks at a mesh; nothing nearer than `near` [m] is drawn."""
-
-    camera: PinholeCamera
-    T_world_camera: NDArray[np.float64]  # (4, 4)
-    near: float = 0.05
 
 
 def render_preview(
@@ -90,104 +73,11 @@ def draw_preview(
         check_choice("preview: view", name, VIEWS)
         if name == "camera" and not has_poses:
             raise InputError("preview: view 'camera' needs a trajectory")
-    drawable = _drawable(mesh)
+    drawable = Drawable.of(mesh)
     chosen = _choose_views(drawable, trajectory if has_poses else None, names, size)
     gap = np.full((size[1], max(2, size[0] // 120), 3), 255, np.uint8)
-    panels = [panel for view in chosen for panel in (gap, _draw(drawable, view))]
+    panels = [panel for view in chosen for panel in (gap, drawable.draw(view))]
     return np.hstack(panels[1:])
-
-
-def render_mesh(mesh: Mesh, view: Viewpoint) -> NDArray[np.uint8]:
-    """Picture (H, W, 3) RGB of the sides of `mesh` that face the camera; InputError for a mesh
-    without a finite triangle.
-    """
-    return _draw(_drawable(mesh), view)
-
-
-# Drawing
-
-
-@dataclass(frozen=True)
-class _Drawable:
-    """A mesh that kernels can take as it is: finite, indices checked, with normals and colours."""
-
-    vertices: NDArray[np.float32]  # (V, 3) world [m]
-    faces: NDArray[np.int32]  # (F, 3)
-    normals: NDArray[np.float32]  # (V, 3) unit
-    colors: NDArray[np.float32]  # (V, 3) RGB in [0, 1]
-    shading: float
-
-
-def _drawable(mesh: Mesh) -> _Drawable:
-    vertices = np.ascontiguousarray(mesh.vertices, np.float32)
-    faces = np.ascontiguousarray(mesh.faces, np.int32)
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise InputError(
-            f"preview: the faces name vertices {faces.min()}..{faces.max()}, but the mesh has {len(vertices)}"
-        )
-    bad = ~np.isfinite(vertices)
-    if bad.any():
-        faces = np.ascontiguousarray(faces[~bad[faces].any(axis=(1, 2))])
-        vertices = np.where(bad.any(axis=1, keepdims=True), np.float32(0), vertices)
-    if not len(faces):
-        raise InputError("preview: the mesh is empty, there is nothing to draw")
-    normals = (
-        vertex_normals(vertices, faces) if mesh.normals is None else np.nan_to_num(mesh.normals)
-    )
-    color = mesh.attributes.get("color")
-    if color is not None and color.shape[1:] != (3,):
-        raise InputError(
-            f"preview: attribute 'color' must be (V, 3) RGB in [0, 1], got {color.shape}"
-        )
-    colors = (
-        np.full_like(vertices, GREY)
-        if color is None
-        else np.clip(np.nan_to_num(color, nan=0.0), 0, 1)
-    )
-    return _Drawable(
-        vertices,
-        faces,
-        np.ascontiguousarray(normals, np.float32),
-        np.ascontiguousarray(colors, np.float32),
-        SHADING[color is not None],
-    )
-
-
-def _draw(drawable: _Drawable, view: Viewpoint) -> NDArray[np.uint8]:
-    camera = view.camera.resized(view.camera.width * SAMPLES, view.camera.height * SAMPLES)
-    drawn = _depth_buffer(drawable, camera, view.T_world_camera, view.near)
-    from .kernels.raster import shade_pixels
-
-    image = np.empty((view.camera.height, view.camera.width, 3), np.uint8)
-    light = np.array(LIGHT) / np.linalg.norm(LIGHT)
-    shade_pixels(
-        drawable.vertices,
-        drawable.normals,
-        drawable.colors,
-        drawable.faces,
-        drawn.projection,
-        np.linalg.inv(view.T_world_camera)[:3],
-        camera.intrinsics,
-        drawn.nearest,
-        (*light, drawable.shading),
-        OCCLUSION_RADIUS,
-        OCCLUSION_TAPS,
-        BACKGROUND,
-        image,
-    )
-    return image
-
-
-def _depth_buffer(
-    drawable: _Drawable, camera: PinholeCamera, T_world_camera: NDArray, near: float
-) -> DepthBuffer:
-    """The depth buffer (H, W) of the sides that face the camera."""
-    return draw_depth_buffer(
-        drawable.vertices, drawable.faces, camera, T_world_camera, near, two_sided=False
-    )
-
-
-# Where to look from
 
 
 @dataclass(frozen=True)
@@ -195,12 +85,11 @@ class _Surface:
     """Triangles drawn evenly from the mesh, each standing for the same area, to judge views by."""
 
     corners: NDArray[np.float64]  # (N, 3, 3) world [m]
-    centers: NDArray[np.float64]  # (N, 3) world [m]
     normals: NDArray[np.float64]  # (N, 3) unit
 
 
 def _choose_views(
-    drawable: _Drawable, trajectory: Trajectory | None, names: Sequence[str], size: tuple[int, int]
+    drawable: Drawable, trajectory: Trajectory | None, names: Sequence[str], size: tuple[int, int]
 ) -> list[Viewpoint]:
     surface = _sample_surface(drawable)
     matrices = () if trajectory is None else trajectory.T_world_camera
@@ -222,7 +111,7 @@ def _choose_views(
     return [makers[name]() for name in names]
 
 
-def _sample_surface(drawable: _Drawable, count: int = 30_000) -> _Surface:
+def _sample_surface(drawable: Drawable, count: int = 30_000) -> _Surface:
     vectors = area_vectors(drawable.vertices, drawable.faces).astype(np.float64)
     areas = np.linalg.norm(vectors, axis=1)
     total = np.cumsum(areas)
@@ -232,7 +121,7 @@ def _sample_surface(drawable: _Drawable, count: int = 30_000) -> _Surface:
         )
     picked = np.searchsorted(total, (np.arange(count) + 0.5) * (total[-1] / count))
     corners = drawable.vertices[drawable.faces[picked]].astype(np.float64)
-    return _Surface(corners, corners.mean(axis=1), vectors[picked] / areas[picked, None])
+    return _Surface(corners, vectors[picked] / areas[picked, None])
 
 
 def _shown_area(surface: _Surface, directions: NDArray) -> NDArray[np.float64]:
@@ -309,7 +198,7 @@ def _overview(
 
 
 def _camera_view(
-    drawable: _Drawable, poses: NDArray, up: NDArray, size: tuple[int, int]
+    drawable: Drawable, poses: NDArray, up: NDArray, size: tuple[int, int]
 ) -> Viewpoint:
     """The view of the recorded camera that sees most, levelled and drawn back; what it left behind
     stays cut away.
@@ -334,9 +223,9 @@ def _camera_view(
     )
 
 
-def _seen_depth(drawable: _Drawable, T_world_camera: NDArray) -> NDArray[np.float32]:
+def _seen_depth(drawable: Drawable, T_world_camera: NDArray) -> NDArray[np.float32]:
     """A small depth image [m] of the mesh from a recorded camera, 0 where there is none or its back
     is seen.
     """
     camera = _pinhole(THUMBNAIL, JUDGED_FOV)
-    return _depth_buffer(drawable, camera, T_world_camera, Viewpoint.near).depth(nothing=0.0)
+    return drawable.depth_buffer(Viewpoint(camera, T_world_camera)).depth(nothing=0.0)

@@ -11,7 +11,8 @@ from places import DATA
 
 from taichi_unifusion.errors import InputError, PoseError
 from taichi_unifusion.rendering.depth_buffer import draw_depth_buffer
-from taichi_unifusion.rendering.preview import Viewpoint, render_mesh, render_preview
+from taichi_unifusion.rendering.drawing import Viewpoint, render_mesh
+from taichi_unifusion.rendering.preview import render_preview
 from taichi_unifusion.types import Mesh, PinholeCamera, Trajectory
 
 cv2 = pytest.importorskip("cv2")
