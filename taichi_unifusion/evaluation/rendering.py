@@ -14,8 +14,8 @@ from ..errors import InputError
 from ..rendering.raycaster import RayCaster
 from ..types import Frame, Mesh
 
-WITHIN = 0.025  # [m] an error below it counts as a good reading
-# [px] of the Gaussian window, with the constants below as Wang et al. 2004 give them
+WITHIN = 0.025  # [m] an error below this counts as correct
+# [px] of the Gaussian window; this and the constants below as in Wang et al. 2004
 SSIM_SIGMA = 1.5
 SSIM_RADIUS = 5  # [px]
 SSIM_CONSTANTS = (0.01**2, 0.03**2)  # for values in [0, 1]
@@ -157,7 +157,7 @@ def ssim(image: NDArray, reference: NDArray, mask: NDArray[np.bool_]) -> float |
     W, c) in [0, 1].
 
     Each pixel's Gaussian window takes in the pixels of `mask` only, with weights that sum to 1 over
-    those, so that what a hole holds plays no part. Pixels within 5 of the image's border are left
+    those, so that the content of holes does not count. Pixels within 5 of the image's border are left
     out, as scikit-image does; None where none is left.
     """
     import cv2

@@ -48,7 +48,7 @@ class SegmentationResult:
     unseen: GroupScore | None
     classes: tuple[ClassScore, ...]
     points: int  # compared
-    ignored: int  # left out, because their true label says so
+    ignored: int  # left out for their true label
     unlabelled: int  # compared, without a predicted label: these count as missed
 
 

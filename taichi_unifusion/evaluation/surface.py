@@ -19,12 +19,12 @@ from .viewpoints import Viewpoints, points_within_view
 
 SAMPLES = 100_000
 THRESHOLDS = (0.025, 0.01)  # [m] the paper's, and one that a 5 cm voxel has to earn
-# [m] a sample this far behind what its pixel shows is still seen: rounding, not a wall's back
+# [m] a true point counts as seen up to this far behind the surface of its pixel: rounding
 OCCLUSION_TOLERANCE = 0.005
-# [m] reconstructed surface so far behind what was seen still counts: 2.5 sigma of a Kinect at 5 m
+# [m] reconstructed surface counts up to this far behind the true one: 2.5 sigma of a Kinect at 5 m
 BEHIND = 0.1
-APART = 1.0  # [m] meshes farther from each other than that are not of one place
-POOL = 4  # times as many samples are drawn where a crop takes some of them away
+APART = 1.0  # [m] meshes farther apart than this cannot be of one place
+POOL = 4  # times as many samples are drawn if a crop will remove some
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from ..errors import InputError
 from ..geometry.time_stamps import associate
 from ..types import Trajectory, check_rigid
 
-MAX_DIFFERENCE = 0.02  # [s] as TUM's benchmark takes it
-FEWEST = 3  # matches; fewer fit anything
-# a spread below this share of the largest is none: positions on a line or in one point
+MAX_DIFFERENCE = 0.02  # [s] of two matched time stamps, as in TUM's benchmark
+FEWEST = 3  # matches; with fewer any alignment fits
+# singular values below this share of the largest count as 0: positions on a line or in one point
 RELATIVE_RANK = 1e-6
 
 

@@ -1,4 +1,4 @@
-"""What a set of cameras looked at: which points they saw, and which space they looked through."""
+"""Which points a set of cameras had in view: in the image, in range and not hidden."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ..geometry.triangles import area_vectors
 from ..rendering.raycaster import RayCaster, RayHits
 from ..types import Mesh, PinholeCamera, check_rigid
 
-# slope of depth, in depths of one pixel's width a pixel: about 80 degrees; beyond it a plane is not
-# trusted
+# largest change of depth a pixel, in pixel widths at that depth (about 80 degrees), for which a
+# triangle's plane is extrapolated from the pixel's centre
 STEEPEST = 8.0
 
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """Where a camera with a limited range looked from."""
+    """The poses of one depth camera, and the range that it measures."""
 
     camera: PinholeCamera
     T_world_camera: NDArray[np.float64]  # (N, 4, 4)
@@ -54,7 +54,7 @@ def points_within_view(
     """
     caster = RayCaster(mesh, "ground truth")
     left = [np.asarray(p, np.float64) for p in points]  # not seen so far
-    rows = [np.arange(len(p)) for p in left]  # theirs
+    rows = [np.arange(len(p)) for p in left]  # of these in `points`
     seen = tuple(np.zeros(len(p), bool) for p in left)
     vertices = caster.mesh.vertices.astype(np.float64)
     corner = vertices[caster.mesh.faces[:, 0]]  # (F, 3) one of each triangle
@@ -86,7 +86,7 @@ def _in_view(
     )
     inside = np.zeros(len(points), bool)
     z = points @ R_world_camera[:, 2] - eye @ R_world_camera[:, 2]
-    # few of many points: the rest is done for these
+    # few points remain: everything below is computed for these alone
     ahead = np.nonzero((z >= views.depth_min) & (z <= views.depth_max))[0]
     to_point, z = points[ahead] - eye, z[ahead]
     u = np.rint(camera.fx * (to_point @ R_world_camera[:, 0]) / z + camera.cx).astype(int)
@@ -97,7 +97,7 @@ def _in_view(
     triangle = hits.triangle[v, u]
     depth = np.where(triangle >= 0, hits.depth[v, u].astype(np.float64), 0.0)
     normal = normals[triangle]
-    # a plane that holds the ray: its depth at the pixel's centre counts
+    # a ray within the triangle's plane gives no depth: the pixel's counts
     with np.errstate(divide="ignore", invalid="ignore"):
         there = (
             z

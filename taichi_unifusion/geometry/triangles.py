@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-# [m] triangles are cut into pieces of at most this edge, to find the nearest ones by their centres
+# [m] longest edge of the pieces that triangles are cut into; the nearest are found by their centres
 PIECE_M = 0.04
-MAX_PIECES = 2_000_000  # 0.3 GB of search tree; of a larger surface the pieces are larger
-CANDIDATES = (24, 96)  # pieces looked at for a point; the second where the first leave a doubt
-# [m] beyond it a doubt is left: the distance is at most the radius of a piece too long
+MAX_PIECES = 2_000_000  # 0.3 GB of search tree; larger surfaces get larger pieces
+CANDIDATES = (24, 96)  # pieces tried for a point; the second number if the first may not suffice
+# [m] exact up to here; beyond, at most one piece's radius too long
 EXACT_M = 0.1
 POINT_CHUNK = 5_000  # points measured at once: some 150 MB of intermediate numbers at most
 
@@ -118,7 +118,7 @@ def _pieces(corners: NDArray, area: float) -> tuple[NDArray[np.float64], NDArray
     """Centres (P, 3) of the pieces of triangles (F, 3, 3) of this total area [m^2], cut in half
     until short; the triangle (P,) of each; and the largest radius [m].
     """
-    # halving leaves pieces of a sixteenth of its square on average
+    # cutting in half leaves pieces with a mean area of edge^2 / 16
     edge = max(PIECE_M, 4 * np.sqrt(area / MAX_PIECES))
     centers, owners, radius, owner = [], [], 0.0, np.arange(len(corners))
     while len(corners):

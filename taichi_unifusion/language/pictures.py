@@ -21,11 +21,11 @@ HEAT = (
     (0.5, (0.78, 0.26, 0.24)),
     (0.75, (0.96, 0.60, 0.14)),
     (1.0, (1.0, 0.92, 0.35)),
-)  # relevance -> RGB: grey where nothing is, bright where it wins
+)  # relevance -> RGB: grey where the query is irrelevant, bright where it wins
 NOTHING = (0.35, 0.35, 0.35)  # RGB of a vertex without a label
-GOLDEN = 0.618033988749895  # steps of hue that stay apart for any number of labels
-NEAR = 1.0  # [m] a camera nearer than this shows too little around
-LABEL_CONTRAST = 0.35  # of a labelled surface's own light and dark
+GOLDEN = 0.618033988749895  # step of hue that keeps any number of labels apart
+NEAR = 1.0  # [m] a camera nearer than this shows too little of the surroundings
+LABEL_CONTRAST = 0.35  # how much of the surface's own light and dark a label's colour keeps
 LEGEND_WIDTH = 320  # [pixels]
 SWATCHES = 18, 38  # [pixels] a row of the legend may be high
 

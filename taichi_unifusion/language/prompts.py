@@ -20,8 +20,8 @@ TEMPLATES = (
     "a photo of a {} in a room",
     "there is a {} in the scene",
 )
-# What a query must beat: words for anything, and what rooms are full of. Those too near to the
-# query drop out.
+# What a query must beat: general words, and what is in every room. Those too similar to the query
+# are left out.
 NEGATIVES = (
     "object",
     "thing",
@@ -49,8 +49,8 @@ NEGATIVES = (
     "plant",
     "person",
 )
-SYNONYM = 0.9  # cosine of two texts above which one does not compete with the other
-LOGIT_SCALE = 100.0  # CLIP's own, learned: cosines become logits
+SYNONYM = 0.9  # cosine above which two texts mean the same and do not compete
+LOGIT_SCALE = 100.0  # learned by CLIP: cosines times this are logits
 
 
 def embed(

@@ -19,7 +19,7 @@ from .regions import MIN_AREA, THRESHOLD, Region, find_regions
 
 UNLABELLED = -1
 POINTS_AT_ONCE = 500_000
-SURE = 2.0  # standard deviations of noise by which a query has to win
+SURE = 2.0  # standard deviations of noise by which a query must win
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Answer:
     """What a query found."""
 
     text: str
-    # (V,) 0..1, 0 where the map knows nothing; 0.5 is a draw with the strongest rival
+    # (V,) 0..1, 0 where the map has no voxel; 0.5 is a draw with the strongest rival
     relevance: NDArray[np.float32]
     similarity: NDArray[np.float32]  # (V,) cosine
     regions: tuple[Region, ...]  # best first
@@ -77,8 +77,8 @@ def _scores(
     """Similarity and relevance (N, n) of n queries, which come before their m rivals in `both`, at
     `distances` (n, m).
 
-    A rival that is as near as noise makes it, by SURE standard deviations, counts as nearer:
-    surface that was seldom seen answers seldom.
+    Rivals' similarities are raised by SURE standard deviations of noise: a query must win clearly,
+    so that rarely seen surface rarely matches.
     """
     similarity, known = features.similarity(points, both, return_valid=True)
     margin = SURE * features.uncertainty(points)[:, None]
@@ -97,7 +97,7 @@ class Segmentation:
     """The best of a list of names everywhere."""
 
     names: tuple[str, ...]
-    labels: NDArray[np.int32]  # (N,) row of names, UNLABELLED where the map knows nothing
+    labels: NDArray[np.int32]  # (N,) row of names, UNLABELLED where the map has no voxel
     confidence: NDArray[np.float32]  # (N,) 0..1, softmax of the best
 
 

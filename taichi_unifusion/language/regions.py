@@ -12,8 +12,8 @@ from ..errors import InputError
 from ..geometry.triangles import vertex_areas
 from ..types import Mesh
 
-THRESHOLD = 0.5  # relevance above which a vertex belongs to a region: it beats all rivals
-MIN_AREA = 0.01  # [m^2] of a region; smaller ones are stray
+THRESHOLD = 0.5  # relevance from which a vertex belongs to a region: the query beats all rivals
+MIN_AREA = 0.01  # [m^2] of a region; smaller ones are noise
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Region:
 def find_regions(
     mesh: Mesh, relevance: NDArray, *, threshold: float = THRESHOLD, min_area: float = MIN_AREA
 ) -> list[Region]:
-    """Connected parts of a mesh where `relevance` (V,) reaches the threshold, by how much of it
-    they hold beyond that.
+    """Connected parts of a mesh where `relevance` (V,) reaches the threshold, those with the largest
+    integral of relevance above it first.
 
     Raises InputError for a relevance of another mesh or a threshold outside 0..1.
     """

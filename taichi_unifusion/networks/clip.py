@@ -1,7 +1,7 @@
 """CLIP and SigLIP by transformers: dense image features without training, and texts.
 
-`dense` is MaskCLIP's way (Zhou et al. 2022): the last attention passes every patch's own value on
-instead of mixing patches, so that each keeps its place. `crops` embeds overlapping windows at
+`dense` is MaskCLIP (Zhou et al. 2022): the last attention layer passes on each patch's own value
+instead of mixing patches, so that features stay in place. `crops` embeds overlapping windows at
 several scales: slower, coarser, with more context.
 """
 
@@ -23,13 +23,13 @@ from .encoders import unit_length
 from .image_input import normalized, resized, whole_patches
 from .onnx_session import first_line
 
-NORMALIZATION = {  # model type -> mean and standard deviation of the training images, where the folder does not say
+NORMALIZATION = {  # model type -> mean and standard deviation of the training images, if the folder has none
     "clip": ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)),
     "siglip": ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
 }
 METHODS = ("dense", "crops")
 SHORT_SIDE = 336  # pixels of the image that a network sees
-CROP_SHARES = (1.0, 0.5, 0.33)  # edges of the windows, by the image's shorter side
+CROP_SHARES = (1.0, 0.5, 0.33)  # edges of the windows over the image's shorter side
 CROP_GRID = 24  # feature pixels along the shorter side
 BATCH = 16
 
@@ -91,7 +91,7 @@ class ClipModel:
                 max_length=self.text_length,
             ).to(self.device)
             if self.kind == "siglip":
-                tokens.pop("attention_mask", None)  # it was trained without
+                tokens.pop("attention_mask", None)  # SigLIP was trained without a mask
             with self.torch.inference_mode():
                 found.append(_pooled(self.model.get_text_features(**tokens)).float().cpu().numpy())
         return unit_length(np.concatenate(found))
@@ -176,8 +176,8 @@ class ClipImageEncoder:
         return self.model.dense_features(self.model.prepared(color, size)[None])[0]
 
     def _crops(self, color: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Mean over the windows that hold a pixel, each counting by how central the pixel lies in
-        it.
+        """Mean over the windows that hold a pixel, weighted by how near the pixel is to the
+        window's centre.
         """
         height, width = color.shape[:2]
         h, w = (max(round(CROP_GRID * side / min(height, width)), 1) for side in (height, width))
@@ -214,8 +214,8 @@ def clip_image_encoder(
     device: str = "auto",
     download: bool = False,
 ) -> ClipImageEncoder:
-    """Image encoder of a CLIP or SigLIP model, a folder or a name; InputError, FileError,
-    MissingDependency as they come.
+    """Image encoder of a CLIP or SigLIP model, a folder or a name; raises InputError,
+    FileError or MissingDependency.
     """
     check_choice("method", method, METHODS)
     if not 32 <= short_side <= 4096:

@@ -39,7 +39,7 @@ def open_session(file: str | Path, device: str = "auto") -> InferenceSession:
             "device: this onnxruntime has no CUDA; pip install onnxruntime-gpu, or choose cpu"
         )
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # what goes wrong is said here
+    options.log_severity_level = 4  # fatal only: our own messages say what failed
     providers = ["CUDAExecutionProvider"] * (has_cuda and device != "cpu") + [
         "CPUExecutionProvider"
     ]

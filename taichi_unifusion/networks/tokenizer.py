@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, InputError
 from ..files.atomic import read_bytes
 
-MERGES = 49152 - 256 - 2  # that CLIP uses of the published list, which is longer
+MERGES = 49152 - 256 - 2  # that CLIP uses; the published list is longer
 WORD_END = "</w>"
 PIECES = re.compile(
     r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[^\W\d_]+|\d|(?:[^\s\w]|_)+",
@@ -62,7 +62,7 @@ class ClipTokenizer:
         return found
 
     def _merge(self, word: str) -> tuple[str, ...]:
-        """The word's tokens: the pair that was learned first is joined first."""
+        """The word's tokens: pairs are joined in the order in which they were learned."""
         if word in self._known:
             return self._known[word]
         parts = (*word[:-1], word[-1] + WORD_END)

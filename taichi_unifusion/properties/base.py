@@ -14,7 +14,7 @@ from ..maps.settings import PropertySettings
 from ..rendering.look import Look
 from ..types import Frame
 
-# files and attributes of every results folder
+# names that files and attributes of a results folder already have
 RESERVED = ("surface", "color", "mesh", "preview", "normals", "features")
 
 
@@ -26,8 +26,8 @@ class SurfaceProperty:
         SurfaceProperty("redness", channels=1, function=redness)
 
     `function` takes a Frame and returns (H, W) or (H, W, c) numbers as large as the depth image;
-    NaN says that there is no value. It raises FrameError where a frame cannot give the property;
-    that frame then adds to the other maps only.
+    NaN means no value. It raises FrameError for a frame that lacks what it needs;
+    that frame is then fused into the other maps only.
     """
 
     name: str

@@ -12,13 +12,13 @@ from ..rendering.look import Look
 from ..types import Frame
 from .base import SurfaceProperty
 
-FULL_SCALE = 65535.0  # what data sets scale infrared to
-KNEE = 100.0  # units up to which the logarithmic curve is nearly straight: about a sensor's noise
+FULL_SCALE = 65535.0  # largest infrared value of a data set
+KNEE = 100.0  # units below which the logarithmic curve is nearly linear: about a sensor's noise
 
 
 def log_infrared() -> SurfaceProperty:
-    """Logarithmic brightness: the light falls with the square of the distance, and a mug near the
-    camera outshines a room.
+    """Logarithmic brightness, because light falls with the square of the distance: a mug near the
+    camera is far brighter than the room.
 
     The same curve for every frame and recording, so that frames agree and maps can be merged: units
     of 0..65535 are `100 (656.35^value - 1)`.

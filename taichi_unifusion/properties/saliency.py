@@ -22,25 +22,24 @@ from ..types import Frame
 from .base import SurfaceProperty, color_of
 
 LOOK = Look("viridis", (0.0, 1.0), "saliency")
-PICTURE = 96  # pixels of the longer side: coarse, so that objects count and not their texture
+PICTURE = 96  # pixels of the longer side: coarse, so that objects count, not their texture
 BLUR = 2.5  # [pixels] of that picture
 BRIGHTEST = 99.5  # percentile that becomes 1
-RANGE_SLACK = 0.01  # of a network that gives [0, 1], for rounding
+RANGE_SLACK = 0.01  # how far outside [0, 1] rounding may take a network's output
 
 
 def signature_saliency() -> SurfaceProperty:
-    """The simple one: the image signature (Hou, Harel and Koch 2012) of lightness and colour; no
-    weights, no learning.
+    """Without weights: the image signature (Hou, Harel and Koch 2012) of lightness and colour.
 
-    It finds what is small and differs from the picture's general texture; a salient-object network
-    finds whole objects.
+    It finds what is small and unlike the rest of the picture; a salient-object network finds whole
+    objects.
     """
 
     def function(frame: Frame) -> NDArray[np.float32]:
         color = color_of(frame)
         height, width = color.shape[:2]
         half = PICTURE / max(height, width) / 2
-        # even, as the transform needs it
+        # the cosine transform needs even sizes
         size = max(4, round(width * half)) * 2, max(4, round(height * half)) * 2
         small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
         lab = cv2.cvtColor(small.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
@@ -77,8 +76,8 @@ def network_saliency(
     one channel out.
 
     The image is resized to `size` (the network's own where it is fixed), scaled to 0..`scale`, and
-    normalised by `mean` and `std`. `activation`: what is still to be done to the output named
-    `output` (the first): nothing, sigmoid, or stretching each frame to [0, 1].
+    normalised by `mean` and `std`. `activation` is applied to the output named `output`
+    (default: the first): nothing, sigmoid, or stretching each frame to [0, 1].
     """
     check_choice("activation", activation, ("none", "sigmoid", "minmax"))
     check_normalization(scale, mean, std, order)

@@ -11,7 +11,7 @@ from ..rendering.look import Look
 from ..types import Frame
 from .base import SurfaceProperty
 
-# relative depth step between pixels beyond which they lie on different surfaces
+# relative depth step beyond which two pixels lie on different surfaces
 FARTHEST_JUMP = 0.03
 
 

@@ -18,8 +18,8 @@ from .base import SurfaceProperty, color_of
 
 LOOK = Look()
 CONTOUR_WIDTH = 2.0  # [pixels]
-FAINTEST = 0.017  # change of brightness a pixel from which there is a contour
-OVERSHOOT = 10.0  # times the stated range that an output may reach before the range must be wrong
+FAINTEST = 0.017  # smallest change of brightness a pixel that gives a contour
+OVERSHOOT = 10.0  # an output this many times beyond the stated range means that the range is wrong
 
 
 def painting_style(
@@ -59,7 +59,7 @@ def opencv_style(*, smoothness: float = 60.0, detail: float = 0.45) -> SurfacePr
 
     def function(frame: Frame) -> NDArray[np.float32]:
         bgr = _bgr_of(frame)
-        # without it flat areas become black
+        # without noise, flat areas become black
         grain = np.random.default_rng(0).integers(0, 2, bgr.shape, dtype=np.uint8)
         painted = cv2.stylization(
             np.where(bgr < 128, bgr + grain, bgr - grain), sigma_s=smoothness, sigma_r=detail

@@ -14,9 +14,9 @@ from .depth_buffer import DepthBuffer, draw_depth_buffer
 
 BACKGROUND = (0.965, 0.97, 0.975)
 GREY = 0.78  # of a mesh without colour
-# how much light changes the colours of a mesh with and without colour
+# how much light changes the colours, 0..1, of a mesh with (True) and without its own
 SHADING = {True: 0.22, False: 0.6}
-# towards it in the camera frame: above, a little left, behind the camera
+# direction to the light, camera frame: above, a little left, behind the camera
 LIGHT = (-0.35, -0.75, -0.55)
 OCCLUSION_RADIUS = 0.25  # [m] of ambient occlusion
 OCCLUSION_TAPS = 4  # per sample; the four samples of a pixel look in different directions

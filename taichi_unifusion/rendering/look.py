@@ -24,7 +24,7 @@ COLORMAPS = {  # name -> OpenCV's number of it; None: made here
 }
 # in L*a*b*: equal in lightness, apart in hue
 BLUE, WHITE, RED = (40.0, 10.0, -50.0), (95.0, 0.0, 0.0), (40.0, 60.0, 35.0)
-# percentiles of the values that a colour map covers where a property states no range
+# percentiles of the values at the ends of the colour map, if a property states no range
 MOST = (1.0, 99.0)
 
 
@@ -33,9 +33,9 @@ class Look:
     """How values become colours."""
 
     colormap: str = "viridis"  # one of COLORMAPS; ignored for three channels, which are RGB
-    # values of its two ends; None: where most values of a mesh lie
+    # values at its two ends; None: the percentiles MOST of a mesh
     range: tuple[float, float] | None = (0.0, 1.0)
-    label: str = ""  # what the values are, with their unit, for the legend
+    label: str = ""  # name and unit of the values, for the legend
 
     def __post_init__(self) -> None:
         check_choice("colormap", self.colormap, COLORMAPS)

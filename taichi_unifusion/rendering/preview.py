@@ -23,16 +23,16 @@ VIEWS = {  # name -> what it shows
     "overview": "from above, walls and ceilings that face away left out",
     "opposite": "the overview from another side",
 }
-# vertical; wider than what a camera records, to count its surroundings too
+# vertical; wider than a recorded image, so that the surroundings count too
 JUDGED_FOV = math.radians(55)
-CANDIDATES = 12  # recorded cameras, evenly over the recording, to choose one from
-THUMBNAIL = (64, 48)  # pixels to judge one by
+CANDIDATES = 12  # cameras, evenly over the recording, of which the best is taken
+THUMBNAIL = (64, 48)  # pixels of the image that a candidate is judged by
 CAMERA_FOV = math.radians(48)  # vertical
-DRAWN_BACK = 0.15  # of the typical depth, to show the surroundings too
+DRAWN_BACK = 0.15  # of the median depth: the camera moves back to show more
 OVERVIEW_FOV = math.radians(32)  # vertical; narrow, so that upright edges stay nearly parallel
 ELEVATION = math.radians(48)  # of the overview
 AZIMUTHS = 24
-MARGIN = 1.04  # of the picture around what is fitted into it
+MARGIN = 1.04  # size of the picture over the size of what is fitted into it
 # share of the surface that may lie outside each side, so that specks do not shrink the rest
 STRAY = 0.002
 
@@ -200,8 +200,8 @@ def _overview(
 def _camera_view(
     drawable: Drawable, poses: NDArray, up: NDArray, size: tuple[int, int]
 ) -> Viewpoint:
-    """The view of the recorded camera that sees most, levelled and drawn back; what it left behind
-    stays cut away.
+    """The view of the recorded camera that sees most, levelled and moved back; what lies in front of
+    the recorded camera's place is not drawn.
     """
     candidates = poses[
         np.unique(np.linspace(0, len(poses) - 1, min(len(poses), CANDIDATES)).astype(int))
@@ -214,7 +214,7 @@ def _camera_view(
     typical_depth = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     forward = T_world_camera[:3, 2]
     R = _rotation_looking(forward, up if abs(forward @ up) < 0.95 else -T_world_camera[:3, 1])
-    back = DRAWN_BACK * typical_depth  # along the line of sight only: beside it there may be a wall
+    back = DRAWN_BACK * typical_depth  # along the line of sight only: a wall may stand beside it
     return _view(
         R,
         T_world_camera[:3, 3] - back * forward,
@@ -224,8 +224,8 @@ def _camera_view(
 
 
 def _seen_depth(drawable: Drawable, T_world_camera: NDArray) -> NDArray[np.float32]:
-    """A small depth image [m] of the mesh from a recorded camera, 0 where there is none or its back
-    is seen.
+    """A small depth image [m] of the mesh from a recorded camera, 0 where nothing or only a back is
+    seen.
     """
     camera = _pinhole(THUMBNAIL, JUDGED_FOV)
     return drawable.depth_buffer(Viewpoint(camera, T_world_camera)).depth(nothing=0.0)

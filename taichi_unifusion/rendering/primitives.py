@@ -78,8 +78,8 @@ def place(
 
 
 def tessellate(primitives: Iterable[Primitive]) -> Mesh:
-    """All primitives as triangles with normals, within CHORD_ERROR of the true surface; faces that
-    touch stay inside.
+    """All primitives as triangles with normals, within CHORD_ERROR of the true surface; where
+    solids touch, their faces stay in the mesh.
     """
     vertices, normals, faces, count = [], [], [], 0
     for p in primitives:

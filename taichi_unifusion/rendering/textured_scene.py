@@ -33,7 +33,7 @@ MAX_TEXELS = 2**31 // 3  # an array of Taichi holds at most 2^31 - 1 numbers
 
 @dataclass(frozen=True)
 class SceneImages:
-    """What a camera sees at the pixels' centres; colour is the mean over the pixel."""
+    """What a camera sees: at the pixels' centres, but colour as the mean over each pixel."""
 
     depth: NDArray[np.float32]  # (H, W) [m], 0 where nothing is hit
     color: NDArray[np.uint8]  # (H, W, 3) RGB
@@ -257,7 +257,7 @@ def _assemble(path: str | Path, parts: Sequence[tuple[str, NDArray, Any]]) -> Te
 
 @dataclass(frozen=True)
 class _Look:
-    """What a mesh looks like: colour factors (V, 3) and, if it has one, a texture with coordinates
+    """How a mesh looks: colour factors (V, 3) and, if it has one, a texture with coordinates that run
     right and down.
     """
 

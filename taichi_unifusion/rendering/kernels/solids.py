@@ -24,7 +24,7 @@ AXIAL = (0.0012, 0.0019)  # [m], [1/m]: sigma = a + b (z - 0.4)^2
 GRAZING = 0.0001  # [m^1.5]: + c / sqrt(z) * theta^2 / (pi/2 - theta)^2
 EDGE_GAP = 0.03  # a neighbour nearer or farther by this share of z is another surface
 BASELINE = 0.075  # [m] between the projector, on the right, and the camera
-# [1/m] steps of 1/8 px of the sensor's own 640 px image, 575 px focal length
+# [m] divided by depth: disparity in steps of 1/8 px, in the sensor's image (640 px, focal length 575 px)
 DISPARITY_STEPS = 8 * 575 * BASELINE
 NEAR_LIMIT, FAR_LIMIT = 0.4, 5.5  # [m] no reading outside
 
@@ -172,7 +172,7 @@ def kinect_depth(
         y = ti.math.clamp(ti.round(v + offset[0], ti.i32), 0, height - 1)
         x = ti.math.clamp(ti.round(u + offset[1], ti.i32), 0, width - 1)
         if ti.abs(exact[y, x] - exact[v, u]) < EDGE_GAP * exact[v, u]:
-            y, x = v, u  # the same surface: its noise is all in the axial term
+            y, x = v, u  # the same surface: the axial term holds all its noise
         z = exact[y, x]
         lit = 1
         reach = ti.min(

@@ -32,9 +32,9 @@ PLAIN, PLANKS, WALLPAPER, WEAVE, BANDS, LANDSCAPE, MOSAIC, RUG, PANELS, GLOBE = 
 
 Corners = ti.types.matrix(2, 3, ti.f32)
 
-# [m] lattice of the three octaves of grain; the finest makes detail of about 1 cm
+# [m] lattice spacings of the three octaves of grain; the finest gives detail of about 1 cm
 GRAIN_CELLS = (0.1, 0.033, 0.011)
-GROUND = 0.02  # [m] surfaces below it and facing up receive the furniture's baked shadow
+GROUND = 0.02  # [m] height up to which surfaces that face up receive the furniture's shadow
 
 
 @ti.func
