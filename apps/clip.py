@@ -1,8 +1,8 @@
 """Map CLIP features with the library and ask for things in plain words, as `unifusion understand`
 and `query` do.
 
-python apps/clip.py 7scenes path/to/redkitchen path/to/clip-vit-base-patch16 "sofa" "something to
-sit on"
+    python apps/clip.py 7scenes path/to/redkitchen path/to/clip-vit-base-patch16 \\
+        "sofa" "something to sit on"
 """
 
 import sys

@@ -1,7 +1,7 @@
 """The infrared field of a surface, from an Azure Kinect recording or any recording with infrared
 images.
 
-python apps/infrared.py k4a path/to/recording.mkv results/infrared
+    python apps/infrared.py k4a path/to/recording.mkv results/infrared
 """
 
 import sys

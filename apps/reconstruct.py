@@ -1,7 +1,7 @@
 """Reconstruct a recording with the library, as `unifusion reconstruct` does: a start for a program
 of your own.
 
-python apps/reconstruct.py 7scenes path/to/redkitchen results/kitchen
+    python apps/reconstruct.py 7scenes path/to/redkitchen results/kitchen
 """
 
 import sys

@@ -1,8 +1,9 @@
 """What draws the eye, on the surface: by a simple detector, or by a salient-object network in an
 ONNX file.
 
-python apps/saliency.py 7scenes path/to/redkitchen results/saliency python apps/saliency.py 7scenes
-path/to/redkitchen results/saliency u2net.onnx,size=320x320,activation=minmax
+    python apps/saliency.py 7scenes path/to/redkitchen results/saliency
+    python apps/saliency.py 7scenes path/to/redkitchen results/saliency \\
+        u2net.onnx,size=320x320,activation=minmax
 """
 
 import sys

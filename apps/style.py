@@ -1,8 +1,8 @@
 """A scene as painted and as drawn, by OpenCV's filters, or in the style of an image-to-image
 network in an ONNX file.
 
-python apps/style.py replica path/to/office0 results/style
-python apps/style.py replica path/to/office0 results/style candy.onnx
+    python apps/style.py replica path/to/office0 results/style
+    python apps/style.py replica path/to/office0 results/style candy.onnx
 """
 
 import sys

@@ -31,7 +31,7 @@ def stop_on_signal(clean_up: Callable[[], None]) -> Iterator[Callable[[], bool]]
     def handle(number: int, stack: object) -> None:
         if not requested.is_set():
             requested.set()
-            # not through sys.stderr or logging, which may be in the middle of a line
+            # not through sys.stderr or logging: the signal may have interrupted one of their lines
             os.write(2, STOPPING)
             return
         try:

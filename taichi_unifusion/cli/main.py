@@ -43,7 +43,7 @@ DESCRIPTION = (
     "unifusion COMMAND --help: explains a command\n\nunifusion --version: prints the version"
 )
 
-# options and function, or a group: its help, its commands
+# name -> options and function of a command, or help and commands of a group
 Commands = dict[str, tuple[type, Callable[..., int] | dict[str, Any]]]
 
 COMMANDS: Commands = {
@@ -70,21 +70,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = _dispatch(argv)
             sys.stdout.flush()
             return code
-        except SystemExit as exit:  # of tyro, after it said what is wrong or printed help
+        except SystemExit as exit:  # from tyro, which has printed help or what is wrong
             return exit.code if isinstance(exit.code, int) else FAILED
         except KeyboardInterrupt:
             logger.error("stopped")
             return INTERRUPTED
-        except BrokenPipeError:  # whoever reads our output has left, as `head` does
+        except BrokenPipeError:  # the reader of our output has left, as `head` does
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return DONE
         except UniFusionError as error:
             if debug:
                 raise
             return report([error])
-        except (
-            OSError
-        ) as error:  # our own files raise FileError; this is standard output, on a full disk
+        except OSError as error:
+            # of standard output, as on a full disk: files raise FileError
             if debug:
                 raise
             return report([FileError(f"output could not be written: {error.strerror or error}")])
@@ -101,7 +100,7 @@ def _dispatch(argv: list[str]) -> int:
 
 def _run(prog: str, description: str, commands: Commands, argv: list[str]) -> int:
     name, arguments = (argv[0], argv[1:]) if argv and argv[0] in commands else (None, argv)
-    if name is None:  # help, or no such command: tyro says it
+    if name is None:  # help, or an unknown command: tyro prints what there is
         _say_commands(prog, description, commands, arguments)
         return FAILED
     options, command = commands[name]

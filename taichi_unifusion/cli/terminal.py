@@ -112,7 +112,7 @@ def _progress_lines() -> Callable[[int, int], None]:
     def update(done: int, total: int) -> None:
         nonlocal first, last
         now = time.perf_counter()
-        first = first or (now, done)  # the first frame includes the compiler's start
+        first = first or (now, done)  # rates leave out the first frame, which includes compiling
         if now - last < LINE_INTERVAL and done < total:
             return
         last, rate = now, (done - first[1]) / (now - first[0]) if now > first[0] else 0.0

@@ -45,7 +45,7 @@ class Understand(Reconstruct):
 
 def understand(options: Understand) -> int:
     """Frames -> maps -> mesh -> results folder."""
-    # first: a recording that cannot be read is said before a network is loaded
+    # opened first, so that an unreadable recording is reported before a network is loaded
     recording = open_recording(options.recording)
     from ..language import make_image_encoder
 

@@ -43,9 +43,9 @@ class FolderWriter:
         """The result of `action`, or None where it failed."""
         try:
             return action()
-        except (FileError, InputError) as error:  # these name the file themselves
+        except (FileError, InputError) as error:  # their messages name the file
             self.failures.append(error)
-        except Exception as error:  # whatever it is, it must not cost the other files
+        except Exception as error:  # no error may cost the other files
             logger.debug("%s", what, exc_info=True)
             self.failures.append(
                 FileError(f"{what} ({type(error).__name__}: {' '.join(str(error).split())[:200]})")

@@ -137,6 +137,8 @@ def read_run(directory: str | Path) -> Run:
             f"{folder.record}: does not say which recording the run was made from; only runs of `unifusion` do"
         )
     skipped = {each.frame for each in frames.skipped_frames}
-    done = source.asked[: frames.used + len(skipped)]  # it may have been stopped early
+    done = source.asked[
+        : frames.used + len(skipped)
+    ]  # the rest was never reached, if the run was stopped early
     used = tuple(i for i in done if i not in skipped)
     return Run(folder, source, used, record.tracking is not None)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import reprlib
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import NoneType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from ..errors import FileError, InputError
+from ..errors import FileError, InputError, convert, shortened
 from ..files.atomic import read_bytes, write_text
 
-SCHEMA_VERSION = 1  # of the file; files without a number are older and are read as version 1
+SCHEMA_VERSION = 1  # files without a number are older, and are read as version 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,18 +188,19 @@ def _decode(wanted: Any, value: Any, at: str) -> Any:
     if NoneType in options:
         return None if value is None else _decode(options[0], value, at)
     if is_dataclass(wanted):
-        return _decode_fields(wanted, _expect(dict, value, at), at)
+        return _decode_fields(wanted, _named_values(value, at), at)
     if origin is Mapping:
         return {
-            str(key): _decode(options[1], item, f"{at}.{key}")
-            for key, item in _expect(dict, value, at).items()
+            name: _decode(options[1], item, f"{at}.{name}")
+            for name, item in _named_values(value, at).items()
         }
     if origin is tuple:
-        items = _expect(list, list(value) if isinstance(value, tuple) else value, at)
-        if options[-1] is not Ellipsis and len(items) != len(options):
-            raise InputError(f"{at}: expected {len(options)} values, got {len(items)}")
-        return tuple(_decode(options[0], item, f"{at}[{i}]") for i, item in enumerate(items))
-    return float(_expect(float, value, at)) if wanted is float else _expect(wanted, value, at)
+        if not isinstance(value, list | tuple):
+            raise InputError(f"{at}: expected a list, got {shortened(value)}")
+        if options[-1] is not Ellipsis and len(value) != len(options):
+            raise InputError(f"{at}: expected {len(options)} values, got {len(value)}")
+        return tuple(_decode(options[0], item, f"{at}[{i}]") for i, item in enumerate(value))
+    return convert(value, wanted, at)
 
 
 def _decode_fields(wanted: Any, values: dict[str, Any], at: str) -> Any:
@@ -214,17 +214,7 @@ def _decode_fields(wanted: Any, values: dict[str, Any], at: str) -> Any:
     return wanted(**given)
 
 
-def _expect(wanted: type, value: Any, at: str) -> Any:
-    """The value, or InputError if it is of another type; bool is no number here."""
-    accepted = (int, float) if wanted is float else (wanted,)
-    if type(value) in accepted:
-        return value
-    kinds = {
-        dict: "names and values",
-        list: "a list",
-        str: "text",
-        bool: "true or false",
-        int: "a whole number",
-        float: "a number",
-    }
-    raise InputError(f"{at or 'the file'}: expected {kinds[wanted]}, got {reprlib.repr(value)}")
+def _named_values(value: Any, at: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{at or 'the file'}: expected names and values, got {shortened(value)}")
+    return value
