@@ -166,9 +166,7 @@ def held_out_points(
     frames: SceneDataset, features: HouseFeatures, indices: range, depth_max: float
 ) -> HeldOut:
     """One in every cube of THIN, of what the views `indices` see within `depth_max` [m]."""
-    camera = frames.camera
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = np.dstack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)])
+    rays = frames.camera.rays()
     found = np.empty((0, 5))
     for index in indices:
         depth, labels, objects = (

@@ -97,10 +97,7 @@ def _places(a: HeldOut, b: HeldOut) -> tuple[NDArray[np.float32], NDArray[np.boo
     the map has both.
     """
     camera = a.frame.camera
-    v, u = np.indices(a.depth.shape, dtype=np.float32)
-    points = np.dstack(
-        [(u - camera.cx) / camera.fx * a.depth, (v - camera.cy) / camera.fy * a.depth, a.depth]
-    )
+    points = camera.rays().astype(np.float32) * a.depth[..., None]
     T = np.linalg.inv(b.frame.T_world_camera) @ a.frame.T_world_camera
     moved = points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
     z = np.maximum(moved[..., 2], 1e-3)

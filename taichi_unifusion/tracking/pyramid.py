@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
 from ..types import Frame, PinholeCamera
+
+if TYPE_CHECKING:
+    import taichi as ti
 
 # [px] wider images are averaged to at least this width; finer ones add time and noise, no accuracy
 FINEST_WIDTH = 320
@@ -36,7 +39,7 @@ class SurfelImage:
     camera of its pixels.
     """
 
-    surfels: Any
+    surfels: ti.Ndarray
     camera: PinholeCamera
 
 
