@@ -117,7 +117,7 @@ def look_at(eye: Sequence[float], target: Sequence[float]) -> NDArray[np.float64
     """T_world_camera of an upright camera at `eye` with `target` on its optical axis; both in world
     [m].
     """
-    forward = np.subtract(target, eye)
+    forward = np.subtract(target, eye, dtype=float)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)

@@ -20,6 +20,7 @@ from taichi_unifusion.errors import (
     MissingDependency,
     PoseError,
 )
+from taichi_unifusion.files.k4a_container import read_images
 
 pytest.importorskip("av", reason="recordings of an Azure Kinect are read with PyAV, extra 'k4a'")
 
@@ -220,7 +221,7 @@ def test_the_real_recording(data):
     np.testing.assert_allclose(
         [color.fx, color.fy, color.cx, color.cy], [611.80, 611.93, 639.30, 365.85], atol=0.01
     )
-    raw = dataset._read(dataset.captures[0], "frame")
+    raw = read_images(dataset.path, dataset.captures[0].stamps, "frame")
     for title, name in (("DEPTH", "depth.png"), ("IR", "ir.png")):
         np.testing.assert_array_equal(
             raw[title], cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
