@@ -76,21 +76,7 @@ def evaluate_segmentation(
             f"segmentation: {len(predicted)} predicted labels but {len(truth)} true ones; both must be of the "
             "same points"
         )
-    known = np.unique(truth)
-    labels = known[
-        ~np.isin(known, list(ignore)) & (np.isin(known, list(names)) if names is not None else True)
-    ]
-    if not len(labels):
-        raise InputError(
-            f"segmentation: no point is left of {len(truth)}; every true label is ignored or has no name"
-        )
-    if len(labels) > MAX_CLASSES:
-        raise InputError(
-            f"segmentation: {len(labels)} different true labels; are these labels of classes?"
-        )
-    for label in unseen:
-        if names is not None and label not in names:
-            raise InputError(f"segmentation: unseen class {label} is not among the names")
+    labels = _compared_labels(truth, names, ignore, unseen)
     kept = np.isin(truth, labels)
     predicted, truth = predicted[kept], truth[kept]
     matrix = confusion_matrix(predicted, truth, labels)
@@ -119,6 +105,31 @@ def evaluate_segmentation(
         int((~kept).sum()),
         int((predicted == UNLABELLED).sum()),
     )
+
+
+def _compared_labels(
+    truth: NDArray,
+    names: Mapping[int, str] | None,
+    ignore: Collection[int],
+    unseen: Collection[int],
+) -> NDArray[np.int64]:
+    """The classes (C,) that are compared, sorted."""
+    known = np.unique(truth)
+    labels = known[
+        ~np.isin(known, list(ignore)) & (np.isin(known, list(names)) if names is not None else True)
+    ]
+    if not len(labels):
+        raise InputError(
+            f"segmentation: no point is left of {len(truth)}; every true label is ignored or has no name"
+        )
+    if len(labels) > MAX_CLASSES:
+        raise InputError(
+            f"segmentation: {len(labels)} different true labels; are these labels of classes?"
+        )
+    for label in unseen:
+        if names is not None and label not in names:
+            raise InputError(f"segmentation: unseen class {label} is not among the names")
+    return labels
 
 
 def confusion_matrix(predicted: NDArray, truth: NDArray, labels: NDArray) -> NDArray[np.int64]:

@@ -29,7 +29,7 @@ Image = ti.types.ndarray(dtype=ti.u8, ndim=3)  # (H, W, 3) RGB
 
 
 @ti.func
-def project(projection: ti.template(), x: ti.template()):
+def to_image(projection: ti.template(), x: ti.template()):
     """Homogeneous image coordinates of world point x, in float64."""
     p = ti.Vector([0.0, 0.0, 0.0], ti.f64)
     for r in ti.static(range(3)):
@@ -95,9 +95,9 @@ def rasterize(
     for v, u in nearest:
         nearest[v, u] = ti.i64(EMPTY)
     for f in range(faces.shape[0]):
-        p0 = project(projection, row3(vertices, faces[f, 0]))
-        p1 = project(projection, row3(vertices, faces[f, 1]))
-        p2 = project(projection, row3(vertices, faces[f, 2]))
+        p0 = to_image(projection, row3(vertices, faces[f, 0]))
+        p1 = to_image(projection, row3(vertices, faces[f, 1]))
+        p2 = to_image(projection, row3(vertices, faces[f, 2]))
         E = edge_functions(p0, p1, p2, two_sided)
         if ti.max(p0[2], p1[2], p2[2]) >= near and E.norm_sqr() > 0.0:
             box = image_box(p0, p1, p2, near, nearest.shape[1], nearest.shape[0])
@@ -188,9 +188,9 @@ def shade_pixels(
                 f = ti.cast(nearest[v, u] & ti.i64(0xFFFFFFFF), ti.i32)
                 a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
                 E = edge_functions(
-                    project(projection, row3(vertices, a)),
-                    project(projection, row3(vertices, b)),
-                    project(projection, row3(vertices, c)),
+                    to_image(projection, row3(vertices, a)),
+                    to_image(projection, row3(vertices, b)),
+                    to_image(projection, row3(vertices, c)),
                     0,
                 )
                 w = E @ ti.Vector([ti.cast(u, ti.f64), ti.cast(v, ti.f64), ti.cast(1.0, ti.f64)])

@@ -10,7 +10,7 @@ import taichi as ti
 
 from ...kernels.camera import Intrinsics, Pose, ray, rotate
 from ...kernels.voxels import Floats2, Ints1, Ints2, row3
-from .raster import EMPTY, DepthBuffer, Image, Projection, depth_of, edge_functions, project
+from .raster import EMPTY, DepthBuffer, Image, Projection, depth_of, edge_functions, to_image
 
 MAX_TAPS = 8  # along the long axis of a footprint; longer ones are blurred
 SLACK = 0.05  # of a tap: a footprint that is square but for rounding takes one
@@ -94,8 +94,8 @@ def shade_triangle(
     RGB in [0, 1].
     """
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-    p0, p1 = project(projection, row3(vertices, a)), project(projection, row3(vertices, b))
-    p2 = project(projection, row3(vertices, c))
+    p0, p1 = to_image(projection, row3(vertices, a)), to_image(projection, row3(vertices, b))
+    p2 = to_image(projection, row3(vertices, c))
     E = edge_functions(p0, p1, p2, 1)
     w = corner_rows(E, u, v)
     D = w.sum()
