@@ -12,11 +12,11 @@ import numpy as np
 
 import taichi_unifusion as uf
 from taichi_unifusion import runtime
-from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.language import unit_length
 from taichi_unifusion.language.embeddings import TextEmbeddings
 from taichi_unifusion.language.questions import ask
 from taichi_unifusion.maps import LatentMap
+from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.types import Mesh
 
 FEATURES = 60, 80  # feature pixels of a frame

@@ -23,13 +23,13 @@ from house_features import NAMES, SINGLE_FRAME, HeldOut, HouseFeatures, find_noi
 from numpy.typing import NDArray
 
 import taichi_unifusion as uf
-from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.datasets.scene import SceneDataset
 from taichi_unifusion.evaluation.segmentation import evaluate_segmentation
 from taichi_unifusion.language.embeddings import TextEmbeddings, read_embeddings
 from taichi_unifusion.language.questions import ask
 from taichi_unifusion.maps import LatentMap
 from taichi_unifusion.maps.encoding import EncoderSettings
+from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.types import Mesh
 
 AVERAGED = (0.2, 0.1, 0.07, 0.05)  # [m] voxels of the averages

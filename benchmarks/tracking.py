@@ -29,9 +29,9 @@ import numpy as np
 import tracking_peers as peers
 
 import taichi_unifusion as uf
-from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.evaluation.trajectory import evaluate_trajectory
 from taichi_unifusion.geometry import se3
+from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.tracking import TrackingSettings
 from taichi_unifusion.tracking.pyramid import SurfelPyramid, build_pyramid, reduce_frame
 from taichi_unifusion.tracking.registration import evaluate, register
