@@ -39,8 +39,8 @@ class TrajectoryResult:
     ate_cm: ErrorStatistics
     # after the best rotation, translation and scale; None where the estimate stands still
     ate_sim3_cm: ErrorStatistics | None
-    ate_unaligned_cm: ErrorStatistics  # as they are
-    scale: float | None  # that the estimate is multiplied by for ate_sim3_cm
+    ate_unaligned_cm: ErrorStatistics  # without any alignment
+    scale: float | None  # the factor of the estimate in ate_sim3_cm
     # error of the motion over `rpe_delta`; None where the trajectory is shorter
     rpe_translation_cm: ErrorStatistics | None
     rpe_rotation_deg: ErrorStatistics | None

@@ -102,8 +102,8 @@ class SurfaceDistance:
     def _measure(
         self, points: NDArray, candidates: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distances (N,) to the triangles of so many nearest pieces, and how far the centre of the
-        last of these lies.
+        """Distances (N,) to the triangles of the `candidates` nearest pieces, and to the centre of
+        the last of these pieces.
         """
         reach, pieces = self.tree.query(points, k=candidates)
         reach = np.reshape(np.asarray(reach, np.float64), (len(points), candidates))

@@ -55,8 +55,8 @@ def resized(image: NDArray, size: tuple[int, int], enlarge: int = cv2.INTER_CUBI
 
 
 def whole_patches(image: NDArray, short_side: int, patch: int) -> tuple[int, int]:
-    """(width, height) of about the shape of an image (H, W, ...) and this shorter side, in whole
-    patches of so many pixels.
+    """(width, height) with about the aspect of an image (H, W, ...) and this shorter side, both
+    multiples of `patch` pixels.
     """
     scale = short_side / min(image.shape[:2])
     height, width = (max(round(side * scale / patch), 1) * patch for side in image.shape[:2])

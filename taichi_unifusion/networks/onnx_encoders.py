@@ -22,7 +22,7 @@ TEXT_LENGTH = 77  # of CLIP
 
 
 class OnnxImageEncoder:
-    """A network of one RGB image (1, 3, H, W): features (1, h, w, c), (1, c, h, w), or one a patch,
+    """A network of one RGB image: features (1, h, w, c), (1, c, h, w), or one a patch,
     (1, [1 +] h w, c).
     """
 

@@ -45,7 +45,7 @@ def open_session(file: str | Path, device: str = "auto") -> InferenceSession:
     ]
     try:  # by path, so that weights in files beside it are found
         return onnxruntime.InferenceSession(str(file), options, providers=providers)
-    except Exception as error:  # onnxruntime has a class of its own for every kind
+    except Exception as error:  # onnxruntime has no common class of errors
         raise FileError(
             f"{file}: not an ONNX model that onnxruntime can run ({first_line(error)})"
         ) from error
@@ -63,7 +63,7 @@ def run_session(
     """
     try:
         return np.asarray(session.run(None if output is None else [output], dict(feeds))[0])
-    except Exception as error:  # onnxruntime has a class of its own for every kind
+    except Exception as error:  # onnxruntime has no common class of errors
         raise InputError(f"{failure} ({first_line(error)})") from error
 
 
