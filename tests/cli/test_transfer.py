@@ -164,7 +164,7 @@ def test_networks_run_and_a_property_that_no_frame_gives_costs_nothing_else(
     )
     said = capsys.readouterr().err
     assert (
-        "property 'style' is empty: none of 2 frames gave it (first: property 'style', frame"
+        f"property 'style' is empty: none of 2 frames gave it (first: property 'style', {recording}"
         in said
     )
     assert "gives 100% NaN or infinite values" in said and "Traceback" not in said
