@@ -20,6 +20,7 @@ from .terminal import frame_progress
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..evaluation.rendering import RenderingResult
     from ..results.reader import Run
     from ..types import Frame
 
@@ -89,7 +90,6 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
 
     from .. import runtime
     from ..config import Config
-    from ..evaluation.rendering import WITHIN
     from ..evaluation.rendering import evaluate_rendering as evaluate
     from ..files.mesh_reading import read_any_mesh
     from ..results.reader import find_run
@@ -115,32 +115,6 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
             depth_max=limits.depth_max if options.depth_max is None else options.depth_max,
         )
     used = set(run.used if run else ()) & {score.index for score in result.frames}
-    rows = [
-        [
-            "depth L1 cm",
-            "median cm",
-            f"within {100 * WITHIN:g} cm %",
-            "coverage %",
-            "PSNR dB",
-            "SSIM",
-        ],
-        [
-            cell(result.depth_l1_cm),
-            cell(result.depth_median_cm),
-            percent(result.depth_within),
-            percent(result.coverage),
-            cell(result.psnr_db),
-            cell(result.ssim, 3),
-        ],
-    ]
-    compared = f"Means over {len(result.frames)} frames of {recording.name}, "
-    compared += (
-        f"{len(used)} of which the run has used"
-        if used
-        else "none of which the run has used"
-        if run
-        else "from file"
-    )
     about = {
         "metric": "rendering",
         "reconstruction": options.reconstruction,
@@ -148,13 +122,29 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
         "used_by_the_run": sorted(used),
         "colour": "map" if color else "vertices",
     }
+    compared = f"{len(used) or 'none'} of which the run has used" if run else "from file"
     return show(
         options.scores,
         about,
         result,
-        format_table(rows),
-        f"{compared}; colour from the {'map' if color else 'vertices'}.",
+        _table(result),
+        f"Means over {len(result.frames)} frames of {recording.name}, {compared}; colour from the "
+        f"{about['colour']}.",
     )
+
+
+def _table(result: RenderingResult) -> str:
+    from ..evaluation.rendering import WITHIN
+
+    scores = {
+        "depth L1 cm": cell(result.depth_l1_cm),
+        "median cm": cell(result.depth_median_cm),
+        f"within {100 * WITHIN:g} cm %": percent(result.depth_within),
+        "coverage %": percent(result.coverage),
+        "PSNR dB": cell(result.psnr_db),
+        "SSIM": cell(result.ssim, 3),
+    }
+    return format_table([[*scores], [*scores.values()]])
 
 
 def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Run | None]:

@@ -14,9 +14,11 @@ from .options import Device, ScoreOptions
 from .scores import cell, check_out, percent, show
 
 if TYPE_CHECKING:
+    from ..evaluation.surface import SurfaceResult
     from ..results.reader import Run
     from ..types import Mesh
 
+EVERYTHING = "Judged is everything, seen or not."
 NO_TRUTH = "surface: give the true mesh too: unifusion evaluate surface MESH TRUTH"
 
 
@@ -92,6 +94,20 @@ def evaluate_surface(options: EvaluateSurface) -> int:
         seed=options.seed,
         distance_to=options.to,
     )
+    about = {
+        "metric": "surface",
+        "reconstruction": options.reconstruction,
+        "ground_truth": options.ground_truth or "the recording's",
+        "seen_by": judge.folder.path if judge and views else None,
+        "distance_to": options.to,
+        "samples": options.samples,
+        "seed": options.seed,
+    }
+    judged = _judged(result, len(views.T_world_camera)) if views else EVERYTHING
+    return show(options.scores, about, result, *_tables(result), judged)
+
+
+def _tables(result: SurfaceResult) -> tuple[str, str]:
     shares = [["within cm", "precision %", "recall %", "F1 %"]]
     shares += [
         [f"{100 * s.threshold:g}", percent(s.precision), percent(s.recall), percent(s.f1)]
@@ -103,26 +119,16 @@ def evaluate_surface(options: EvaluateSurface) -> int:
         ["truth to reconstruction (completeness)", cell(result.completeness_cm)],
         ["mean of both (Chamfer)", cell(result.chamfer_cm)],
     ]
-    judged = "Judged is everything, seen or not."
-    if views:
-        shares_seen = (
-            percent(1 - result.ground_truth_unseen),
-            percent(1 - result.reconstruction_unseen),
-        )
-        judged = (
-            f"Judged is what {len(views.T_world_camera)} frames could tell: {shares_seen[0]} % of the true surface, "
-            f"{shares_seen[1]} % of the reconstruction; --whole judges all."
-        )
-    about = {
-        "metric": "surface",
-        "reconstruction": options.reconstruction,
-        "ground_truth": options.ground_truth or "the recording's",
-        "seen_by": judge.folder.path if judge and views else None,
-        "distance_to": options.to,
-        "samples": options.samples,
-        "seed": options.seed,
-    }
-    return show(options.scores, about, result, format_table(shares), format_table(means), judged)
+    return format_table(shares), format_table(means)
+
+
+def _judged(result: SurfaceResult, frames: int) -> str:
+    """What share of both surfaces was judged."""
+    return (
+        f"Judged is what {frames} frames could tell: {percent(1 - result.ground_truth_unseen)} % of the "
+        f"true surface, {percent(1 - result.reconstruction_unseen)} % of the reconstruction; --whole "
+        "judges all."
+    )
 
 
 def _own_truth(run: Run | None) -> Mesh:
