@@ -16,7 +16,10 @@ def main(format: str, path: str, model: str, *texts: str) -> None:
     pipeline = uf.Pipeline(uf.Config(), encoder=make_image_encoder(f"clip:{model}"))
     pipeline.run(uf.open_dataset(format, path)[::10])
     for answer in ask(
-        pipeline.features, pipeline.extract_mesh(), make_text_encoder(f"clip:{model}"), texts
+        pipeline.maps["features"],
+        pipeline.extract_mesh(),
+        make_text_encoder(f"clip:{model}"),
+        texts,
     ):
         best = f"best at {answer.regions[0].centroid.round(2)} m" if answer.found else "not here"
         print(f"{answer.text}: {len(answer.regions)} regions, {best}")

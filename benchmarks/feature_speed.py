@@ -15,7 +15,7 @@ from taichi_unifusion import runtime
 from taichi_unifusion.language import unit_length
 from taichi_unifusion.language.embeddings import TextEmbeddings
 from taichi_unifusion.language.questions import ask
-from taichi_unifusion.maps import LatentMap
+from taichi_unifusion.maps import FeatureMap
 from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.types import Mesh
 
@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> None:
         values = unit_length(rng.standard_normal((*FEATURES, options.channels), dtype=np.float32))
         cloud = uf.preprocess(frame.with_features("features", values))
         clouds.append(cloud.transformed(frame.T_world_camera))
-    features = LatentMap("features", options.channels)
+    features = FeatureMap("features", options.channels)
     # the first compile
     steps = [seconds(lambda cloud=cloud: features.integrate(cloud)) for cloud in clouds][2:]
     points = np.resize(np.concatenate([cloud.points for cloud in clouds]), (options.vertices, 3))

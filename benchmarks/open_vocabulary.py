@@ -27,7 +27,7 @@ from taichi_unifusion.datasets.scene import SceneDataset
 from taichi_unifusion.evaluation.segmentation import evaluate_segmentation
 from taichi_unifusion.language.embeddings import TextEmbeddings, read_embeddings
 from taichi_unifusion.language.questions import ask
-from taichi_unifusion.maps import LatentMap
+from taichi_unifusion.maps import FeatureMap
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.results.tables import format_table
 from taichi_unifusion.types import Mesh
@@ -144,24 +144,30 @@ def run(options: argparse.Namespace) -> None:
     test = held_out_points(
         frames, features, range(mapped.step // 2, len(frames), mapped.step * 2), DEPTH_MAX
     )
-    known = pipeline.features.similarity(test.points, texts[0], return_valid=True)[1]
+    known = pipeline.maps["features"].similarity(test.points, texts[0], return_valid=True)[1]
     test = HeldOut(test.points[known], test.labels[known], test.objects[known])
-    print(table_of_answers(pipeline.features, averages, test, texts, names), "\n", flush=True)
+    print(
+        table_of_answers(pipeline.maps["features"], averages, test, texts, names), "\n", flush=True
+    )
     if options.out:
         from taichi_unifusion.results.writer import write_results
 
         write_results(options.out, pipeline, result)
-    print(table_of_memory(pipeline.features, variants, test, texts, names), "\n", flush=True)
     print(
-        table_of_queries(pipeline.features, pipeline.extract_mesh(), encoder, test, frames, names),
+        table_of_memory(pipeline.maps["features"], variants, test, texts, names), "\n", flush=True
+    )
+    print(
+        table_of_queries(
+            pipeline.maps["features"], pipeline.extract_mesh(), encoder, test, frames, names
+        ),
         flush=True,
     )
 
 
-def make_map(name: str, channels: int) -> LatentMap:
+def make_map(name: str, channels: int) -> FeatureMap:
     """An empty map of PRECISION:RANK."""
     precision, rank = name.split(":")
-    return LatentMap(
+    return FeatureMap(
         "features", channels, encoder=EncoderSettings(rank=int(rank)), precision=precision
     )
 
@@ -178,7 +184,7 @@ def seen_products(cloud: uf.PointCloud, texts: NDArray) -> NDArray[np.float32]:
 
 
 def table_of_answers(
-    features: LatentMap, averages: list[Averages], test: HeldOut, texts: NDArray, names: list[str]
+    features: FeatureMap, averages: list[Averages], test: HeldOut, texts: NDArray, names: list[str]
 ) -> str:
     """Accuracy and mean IoU of the best name at the test points."""
     methods = {
@@ -199,7 +205,11 @@ def table_of_answers(
 
 
 def table_of_memory(
-    ours: LatentMap, variants: dict[str, LatentMap], test: HeldOut, texts: NDArray, names: list[str]
+    ours: FeatureMap,
+    variants: dict[str, FeatureMap],
+    test: HeldOut,
+    texts: NDArray,
+    names: list[str],
 ) -> str:
     """Bytes, files and answers beside those of the map as published; and of ours in a basis of few
     directions.
@@ -264,16 +274,16 @@ def table_of_memory(
     )
 
 
-def strongest_directions(features: LatentMap, k: int) -> NDArray[np.float32]:
+def strongest_directions(features: FeatureMap, k: int) -> NDArray[np.float32]:
     """(c, k) principal directions of the voxels' means by weight: what an online basis could at
     best have learned.
     """
-    means = features._export_rows().means.astype(np.float32)
-    weights = features._grid.export().weights
+    voxels = features.voxels()
+    means, weights = voxels.fields["means"].astype(np.float32), voxels.weights
     return np.linalg.eigh((means * weights[:, None]).T @ means)[1][:, -k:].astype(np.float32)
 
 
-def file_bytes(features: LatentMap) -> int:
+def file_bytes(features: FeatureMap) -> int:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "features.safetensors"
         features.save(path)
@@ -281,7 +291,7 @@ def file_bytes(features: LatentMap) -> int:
 
 
 def table_of_queries(
-    features: LatentMap,
+    features: FeatureMap,
     mesh: Mesh,
     encoder: TextEmbeddings,
     test: HeldOut,

@@ -16,7 +16,7 @@ import yaml
 
 from .errors import ConfigError, InputError, convert, did_you_mean, shortened
 from .files.strict_yaml import read_yaml
-from .maps.settings import LatentSettings, PropertySettings, SurfaceSettings
+from .maps.settings import FeatureSettings, PropertySettings, SurfaceSettings
 from .preprocessing import PreprocessSettings
 from .tracking.base import TrackingSettings
 
@@ -66,7 +66,7 @@ class Config:
     """
     property_map: PropertySettings = field(default_factory=lambda: PropertySettings(voxel_size=0.1))
     """The maps of these; a property may say otherwise, as in saliency,voxel_size=0.05."""
-    feature_map: LatentSettings = field(default_factory=LatentSettings)
+    feature_map: FeatureSettings = field(default_factory=FeatureSettings)
     """The map of image-text features."""
     mesh: MeshSettings = field(default_factory=MeshSettings)
     """The mesh."""

@@ -8,33 +8,45 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
 from . import runtime
 from .config import Config
 from .datasets.loading import load_ahead
-from .errors import FrameError, InputError, PoseError, UniFusionError
-from .language import ImageEncoder, feature_image
-from .maps import BaseMap, LatentMap, PropertyMap, SurfaceMap
+from .errors import FrameError, InputError, UniFusionError
+from .language.source import FeatureSource
+from .maps import BaseMap, Integration, PropertyMap, SurfaceMap
 from .maps.property_group import group_maps
+from .networks.encoders import ImageEncoder
 from .preprocessing import PreprocessSettings, preprocess
 from .properties import SurfaceProperty, make_property
 from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult
 from .types import Frame, Mesh
 
-FEATURES = "features"  # name of the map of image-text features
+
+class Source(Protocol):
+    """What makes an image of a property from a frame (f_im, Fig. 6), and a map for it."""
+
+    @property
+    def name(self) -> str: ...
+
+    def add_to(self, frame: Frame) -> Frame: ...
+
+    def make_map(self, frame: Frame) -> BaseMap: ...
 
 
 class Pipeline:
     """Fuses frames into a surface map, a colour map, and a map for every property that the
-    configuration or the caller names.
-
-    With an image encoder also into a map of its features, named FEATURES.
+    configuration or the caller names; with an image encoder also into a map of its features.
 
         pipeline = Pipeline(Config(properties=("saliency",)))
         pipeline.run(open_dataset("7scenes", path)[::10])
         pipeline.extract_mesh().save("kitchen.ply")
+
+    With `synchronize` off, the times of stages are those of launching them: CUDA may then overlap
+    them.
     """
 
     def __init__(
@@ -42,33 +54,27 @@ class Pipeline:
         config: Config | None = None,
         properties: Iterable[SurfaceProperty] = (),
         encoder: ImageEncoder | None = None,
+        *,
+        synchronize: bool = True,
     ) -> None:
-        self.config, self.encoder = config or Config(), encoder
-        made = (make_property(text, self.config.property_map) for text in self.config.properties)
-        self.sources = _by_name((*made, *properties))
-        runtime.init(self.config.device, threads=self.config.threads or None)
-        self.surface = SurfaceMap(self.config.surface)
-        self.properties = {
-            "color": PropertyMap("color", 3, self.config.color),
-            **{
-                name: PropertyMap(
-                    name, source.channels, source.settings or self.config.property_map
-                )
-                for name, source in self.sources.items()
-            },
-        }
-        self.groups = group_maps(self.properties.values())
-        # until the first features say how many channels they have
-        self.features: LatentMap | None = None
+        self.config = config = config or Config()
+        self.synchronize = synchronize
+        made = [make_property(text, config.property_map) for text in config.properties]
+        made = [source.with_settings(config.property_map) for source in (*made, *properties)]
+        features = [FeatureSource(encoder, config.feature_map)] if encoder is not None else []
+        self.sources: dict[str, Source] = _by_name((*made, *features))
+        runtime.init(config.device, threads=config.threads or None)
+        self.surface = SurfaceMap(config.surface)
+        color = PropertyMap("color", 3, config.color)
+        self.maps: dict[str, BaseMap] = {each.name: each for each in (self.surface, color)}
+        for source in made:  # maps of features wait for the first features
+            self.maps[source.name] = source.make_map()
+        self.groups = group_maps(self.maps.values())
 
     @property
-    def maps(self) -> dict[str, BaseMap]:
-        """All maps by name, the surface first."""
-        return {
-            "surface": self.surface,
-            **self.properties,
-            **({} if self.features is None else {FEATURES: self.features}),
-        }
+    def properties(self) -> dict[str, PropertyMap]:
+        """The maps whose values a mesh carries, by name."""
+        return {name: each for name, each in self.maps.items() if isinstance(each, PropertyMap)}
 
     def step(self, frame: Frame) -> StepResult:
         """Fuse one frame; a property that the frame lacks, or does not allow to be made, is left
@@ -77,28 +83,21 @@ class Pipeline:
         Raises FrameError where the frame has no pose or no usable depth, OutOfRange where it lies
         beyond a map's index range, CapacityError where a map would grow beyond safe memory.
         """
-        clock = StageClock()
-        if frame.T_world_camera is None:
-            raise PoseError(f"{frame.label}: there is no pose for this frame")
+        clock = StageClock(self.synchronize)
+        T_world_camera = frame.require_pose()
         frame, lacking = self._with_properties(frame, clock)
         with clock.stage("preprocess"):
             cloud = preprocess(frame, self.config.preprocess)
         if len(cloud) == 0:
             raise EmptyFrame(f"{frame.label}: {_why_empty(frame, self.config.preprocess)}")
         with clock.stage("transform"):
-            cloud = cloud.transformed(frame.T_world_camera)
-        with clock.stage("surface"):
-            integrations = {"surface": self.surface.integrate(cloud)}
+            cloud = cloud.transformed(T_world_camera)
+        done: dict[str, Integration] = {}
         for group in self.groups:
-            if name := group.name_in(cloud):
-                with clock.stage(name):
-                    integrations |= group.integrate(cloud)
-        if FEATURES in cloud.features:
-            with clock.stage(FEATURES):
-                integrations[FEATURES] = self.features.integrate(cloud)
-        return StepResult(
-            frame.index, frame.name, len(cloud), integrations, clock.milliseconds, lacking
-        )
+            if names := group.names_in(cloud):
+                with clock.stage(" + ".join(names)):
+                    done |= group.integrate(cloud)
+        return StepResult(frame.index, frame.name, len(cloud), done, clock.milliseconds, lacking)
 
     def _with_properties(self, frame: Frame, clock: StageClock) -> tuple[Frame, dict[str, str]]:
         """The frame with an image of every property (f_im, Fig. 6), and by name why one cannot be
@@ -108,21 +107,13 @@ class Pipeline:
         for name, source in self.sources.items():
             try:
                 with clock.stage(f"{name} image"):
-                    frame = frame.with_image(name, source.image(frame))
+                    frame = source.add_to(frame)
+                if name not in self.maps:
+                    self.maps[name] = source.make_map(frame)
+                    self.groups = group_maps(self.maps.values())
             except FrameError as error:
                 lacking[name] = str(error)
                 frame = frame.without_image(name)
-        if self.encoder is not None:
-            try:
-                with clock.stage(f"{FEATURES} image"):
-                    frame = frame.with_features(FEATURES, feature_image(self.encoder, frame))
-                channels = frame.features[FEATURES].values.shape[2]
-                if self.features is None:
-                    self.features = LatentMap(
-                        FEATURES, channels, self.config.feature_map, source=self.encoder.name
-                    )
-            except FrameError as error:
-                lacking[FEATURES] = str(error)
         return frame, lacking
 
     def run(
@@ -132,13 +123,15 @@ class Pipeline:
         strict: bool = False,
         stop: Callable[[], bool] = lambda: False,
         on_frame: Callable[[int, int], None] = lambda done, total: None,
+        on_step: Callable[[StepResult, Pipeline], None] = lambda step, pipeline: None,
     ) -> RunResult:
         """Fuse a sequence in order, skipping frames that cannot be used; `strict` ends the run at
         the first of them.
 
-        `stop` is asked before every frame, `on_frame` told after it. What ends a run early is in
-        the result, with all that was done until then; raises DatasetError only where not one frame
-        could be used.
+        `stop` is asked before every frame, `on_frame` told after it how many there were, `on_step`
+        after each that was fused what it did: there a viewer can look at the maps. What ends a run
+        early is in the result, with all that was done until then; raises DatasetError only where
+        not one frame could be used.
         """
         log, failure, interrupted = RunLog(sequence), None, False
         for i, load in enumerate(load_ahead(sequence)):
@@ -149,7 +142,9 @@ class Pipeline:
                 frame = load()
                 waited = time.perf_counter() - waiting
                 log.check_depth_scale(frame)
-                log.add_step(frame, self.step(frame), waited)
+                step = self.step(frame)
+                log.add_step(frame, step, waited)
+                on_step(step, self)
             except tuple(SKIP_REASONS) as error:
                 log.add_skipped(i, error)
                 failure = error if strict else None
@@ -173,13 +168,13 @@ class Pipeline:
         )
 
 
-def _by_name(properties: Iterable[SurfaceProperty]) -> dict[str, SurfaceProperty]:
-    named: dict[str, SurfaceProperty] = {}
-    for made in properties:
-        if named.setdefault(made.name, made) is not made:
+def _by_name(sources: Iterable[Source]) -> dict[str, Source]:
+    named: dict[str, Source] = {}
+    for source in sources:
+        if named.setdefault(source.name, source) is not source:
             raise InputError(
-                f"property '{made.name}' is asked for twice; give one of them another name, as in "
-                f"{made.name},name=other"
+                f"property '{source.name}' is asked for twice; give one of them another name, as in "
+                f"{source.name},name=other"
             )
     return named
 
@@ -200,15 +195,17 @@ def extract_mesh(
 
 @dataclass
 class StageClock:
-    """Milliseconds by stage, with the device's work included."""
+    """Milliseconds by stage; with `synchronize`, the device's work is included."""
 
+    synchronize: bool = True
     milliseconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        runtime.synchronize()
+        if self.synchronize:
+            runtime.synchronize()
         self.milliseconds[name] = 1e3 * (time.perf_counter() - start)
 
 
@@ -219,6 +216,7 @@ def _why_empty(frame: Frame, settings: PreprocessSettings) -> str:
     if not ((readings >= settings.depth_min) & (readings <= settings.depth_max)).any():
         return (
             f"all depth readings lie outside {settings.depth_min:g}..{settings.depth_max:g} m "
-            f"(median {np.median(readings):.3g} m); is the depth scale wrong? Else see preprocess.depth_min and depth_max"
+            f"(median {np.median(readings):.3g} m); is the depth scale wrong? "
+            "Else see preprocess.depth_min and depth_max"
         )
     return f"all {len(readings)} depth readings lie on edges, on grazing surfaces or too far apart"

@@ -139,14 +139,15 @@ def _scratch(live: runtime.Runtime, shape: tuple[int, int]) -> tuple:
     """
     import taichi as ti
 
-    if shape not in live.scratch:
-        live.scratch[shape] = (
+    def make() -> tuple:
+        return (
             ti.ndarray(ti.f32, shape),
             ti.ndarray(ti.f32, shape),
             ti.ndarray(ti.f32, (*shape, 3)),
             ti.ndarray(ti.i32, (shape[0] * shape[1], 2)),
         )
-    return live.scratch[shape]
+
+    return live.arena.exact("images of a frame", make, shape)
 
 
 def _channels(frame: Frame) -> dict[str, int]:

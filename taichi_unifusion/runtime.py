@@ -11,40 +11,90 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 from .errors import CapacityError, MissingDependency, RuntimeStateError, check_choice
 
 logger = logging.getLogger(__name__)
+
+# A ti.Ndarray, or a NumPy array where a kernel is given one: Taichi has no types for a checker.
+DeviceArray = Any
 
 DEVICES = ("auto", "cuda", "cpu")
 STALE_LOCK = 60  # [s] Taichi locks its cache of compiled kernels for a second or two
 MAX_TREES = 12  # each reserves some 80 MB of a pool that fails silently somewhat above 1.6 GB
 
 
-@dataclass(frozen=True, eq=False)
+def grown(room: int, needed: int) -> int:
+    """Room for `needed` rows where there is `room`: it doubles, so that growing stays cheap."""
+    return room if needed <= room else max(2 * room, needed)
+
+
+class Arena:
+    """Device arrays that are used again and again, so that a frame allocates nothing.
+
+    What is borrowed is on loan for one turn: it may be overwritten as soon as the next turn begins.
+    New arrays are zero; old ones are as their last user left them.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple, Any] = {}
+        self._turn = 0
+
+    def borrow(self, name: str, dtype: Any, shape: tuple[int, ...]) -> DeviceArray:
+        """A device array of at least `shape[0]` rows of shape `shape[1:]`, for the use `name`."""
+        import taichi as ti
+
+        key = (name, str(dtype), shape[1:])
+        known = self._arrays.get(key)
+        if known is None or known.shape[0] < shape[0]:
+            rows = grown(known.shape[0] if known is not None else shape[0], shape[0])
+            self._arrays[key] = ti.ndarray(dtype, (rows, *shape[1:]))
+        return self._arrays[key]
+
+    def exact(self, name: str, make: Callable[[], Any], shape: tuple[int, ...]) -> Any:
+        """What `make` makes, once for every use `name` and shape."""
+        key = (name, shape)
+        if key not in self._arrays:
+            self._arrays[key] = make()
+        return self._arrays[key]
+
+    def next_turn(self) -> int:
+        """Begin a turn: all loans of earlier turns are over."""
+        self._turn += 1
+        return self._turn
+
+    def check_loan(self, turn: int | None) -> None:
+        """Raise RuntimeStateError where what was borrowed in `turn` may have been overwritten."""
+        if turn is not None and turn != self._turn:
+            raise RuntimeStateError(
+                "this local LIM is no longer there: another cloud was encoded since; fuse it "
+                "before that, or keep local.copy()"
+            )
+
+
 class Runtime:
     """A started Taichi: `device` is "cuda" or "cpu", `description` names it for people."""
 
-    device: str
-    description: str
-    # index trees of maps that are gone: Taichi cannot free them
-    free_trees: list = field(default_factory=list, repr=False)
-    trees: list = field(default_factory=lambda: [0], repr=False)
-    scratch: dict = field(default_factory=dict, repr=False)  # shape -> arrays that all use in turn
+    def __init__(self, device: str, description: str) -> None:
+        self.device, self.description = device, description
+        self.arena = Arena()
+        self.trees = 0  # index trees made
+        self.free_trees: list[Any] = []  # those of maps that are gone: Taichi cannot free them
 
     def count_tree(self) -> None:
         """Note that one more index tree is made; raises CapacityError before there are more than
         Taichi bears.
         """
-        if self.trees[0] >= MAX_TREES:
+        if self.trees >= MAX_TREES:
             raise CapacityError(
                 f"more than {MAX_TREES} maps live at once: delete or save some, or use another process"
             )
-        self.trees[0] += 1
+        self.trees += 1
 
 
 _runtime: Runtime | None = None
@@ -77,9 +127,13 @@ def init(
         os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")
         or ti.lang.impl.default_cfg().offline_cache_file_path
     )
-    options = dict(
-        log_level=ti.ERROR, offline_cache=True, debug=debug, default_fp=ti.f32, default_ip=ti.i32
-    )
+    options: dict[str, Any] = {
+        "log_level": ti.ERROR,
+        "offline_cache": True,
+        "debug": debug,
+        "default_fp": ti.f32,
+        "default_ip": ti.i32,
+    }
     if threads:
         options["cpu_max_num_threads"] = threads
     wanted = ti.cpu if device == "cpu" else ti.cuda  # never ti.gpu: Vulkan has no pointer SNodes
@@ -133,7 +187,7 @@ def _say(sentence: str) -> None:
         print(sentence, file=sys.stderr)
 
 
-def _import_taichi():
+def _import_taichi() -> Any:
     os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
     try:
         import taichi

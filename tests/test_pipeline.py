@@ -36,13 +36,17 @@ def with_one_reading(frame):
 class StubMap:
     """Stands in for a map where a test is about the loop around it: keeps what it is given."""
 
-    name, settings = "color", None
+    settings = None
 
-    def __init__(self, *arguments) -> None:
+    def __init__(self, name="surface", *arguments) -> None:
+        self.name = name if isinstance(name, str) else "surface"
         self.clouds = []
 
     def __len__(self):
         return len(self.clouds)
+
+    def wants(self, cloud):
+        return self.name == "surface" or self.name in cloud.attributes
 
     def integrate(self, cloud):
         self.clouds.append(cloud)

@@ -2,8 +2,6 @@
 
 import taichi as ti
 
-from .voxels import Floats2
-
 LOG2_E = 1.4426950408889634
 
 
@@ -74,42 +72,3 @@ def position_gradient(
         for i in ti.static(range(rank)):
             g[i] += slope * projection[i, a]
     return g
-
-
-@ti.kernel
-def encode_positions(
-    # in:
-    rank: ti.template(),
-    t: Floats2,  # (N, 3)
-    anchors: Floats2,  # (3, A)
-    projection: Floats2,  # (l, A)
-    scale: ti.f32,
-    # out:
-    features: Floats2,  # (N, l)
-):
-    for n in range(t.shape[0]):
-        f = position_features(
-            ti.Vector([t[n, 0], t[n, 1], t[n, 2]]), rank, anchors, projection, scale
-        )
-        for i in ti.static(range(rank)):
-            features[n, i] = f[i]
-
-
-@ti.kernel
-def encode_gradients(
-    # in:
-    rank: ti.template(),
-    t: Floats2,  # (N, 3)
-    anchors: Floats2,
-    projection: Floats2,
-    scale: ti.f32,
-    # out:
-    gradients: ti.types.ndarray(dtype=ti.f32, ndim=3),  # (N, 3, l)
-):
-    for n in range(t.shape[0]):
-        for axis in range(3):
-            g = position_gradient(
-                ti.Vector([t[n, 0], t[n, 1], t[n, 2]]), axis, rank, anchors, projection, scale
-            )
-            for i in ti.static(range(rank)):
-                gradients[n, axis, i] = g[i]

@@ -4,17 +4,17 @@ regression over all frames.
 
 import taichi as ti
 
+from .arrays import Floats1, Floats2, Floats3, Ints1, Masks2
 from .regression import solve_voxel
-from .voxels import Floats1, Floats2, Floats3, Ints1, Masks2
 
-LEAST_WEIGHT = 0.5  # weights count points: less is what rounding leaves when all were taken out
+# weights are numbers of points; a remainder below this is rounding and counts as empty
+LEAST_WEIGHT = 0.5
 
 
 @ti.kernel
 def fuse(
     # in:
-    rows: ti.template(),
-    channels: ti.template(),
+    layout: ti.template(),
     first: ti.i32,  # column of `latents` that is the map's first
     voxels: ti.i32,
     slots: Ints1,  # (B,) slot in the map, -1 where none
@@ -22,11 +22,12 @@ def fuse(
     weights: Floats1,  # (B,) w'
     masks: Masks2,  # (B, 2) support
     sign: ti.f32,  # 1; -1 takes out again what was fused
-    # out:
+    # in and out:
     map_latents: Floats3,  # (S, r, c) F <- (F w + F' w') / (w + w')
     map_weights: Floats1,  # (S,) w <- w + w'
     map_masks: Masks2,  # (S, 2) |=
 ):
+    channels = ti.static(layout.channels)
     for v in range(voxels):
         s = slots[v]
         if s >= 0:
@@ -35,7 +36,7 @@ def fuse(
             share = 1.0  # exactly, so that a loaded map equals the saved one
             if old > 0 and total > 0:
                 share = new / total
-            for a in range(rows):
+            for a in range(layout.latent_rows):
                 # all reads before all writes
                 old_row = ti.Vector([map_latents[s, a, c] for c in ti.static(range(channels))])
                 new_row = ti.Vector([latents[v, a, first + c] for c in ti.static(range(channels))])
@@ -48,20 +49,14 @@ def fuse(
 
 
 @ti.func
-def encoded_place(
-    q: ti.i32,
-    size: ti.template(),
-    channels: ti.template(),
-    centered: ti.template(),
-    first: ti.i32,
-    encoded: ti.i32,
-) -> ti.i32:
+def encoded_place(layout: ti.template(), q: ti.i32, first: ti.i32, encoded: ti.i32) -> ti.i32:
     """Where number q of a map's sums stands in the sums of `encoded` channels of which the map has
     those from `first` on.
     """
+    size, channels = ti.static(layout.size, layout.channels)
     targets = size * (size + 1) // 2
     ones = targets + size * channels
-    means = ones + size * ti.static(int(centered))
+    means = ones + size * ti.static(int(layout.centered))
     place = q
     if q >= means:
         place += size * (encoded - channels) + first
@@ -75,62 +70,45 @@ def encoded_place(
 @ti.kernel
 def fuse_information(
     # in:
-    rank: ti.template(),
-    size: ti.template(),
-    rows: ti.template(),
-    channels: ti.template(),
-    centered: ti.template(),
-    first: ti.i32,
-    encoded: ti.i32,  # channel of the sums that is the map's first, and how many they have
+    layout: ti.template(),
+    first: ti.i32,  # channel of the sums that is the map's first
+    encoded: ti.i32,  # channels that they have
     voxels: ti.i32,
     slots: Ints1,  # (B,) slot in the map, -1 where none
-    sums: Floats2,  # (B, q or more) as `keep_sums`
+    sums: Floats3,  # (B, q or more, 1) as `keep_sums`
     weights: Floats1,  # (B,) w'
     masks: Masks2,  # (B, 2) support
     sign: ti.f32,  # 1; -1 takes out again what was fused
     noise: ti.f32,
-    # out:
+    # in and out:
     map_sums: Floats2,  # (S, q) += sums
-    map_latents: Floats3,  # (S, r, c) F of the regression over all that was fused (Eq. 6)
     map_weights: Floats1,  # (S,) w <- w + w'
     map_masks: Masks2,  # (S, 2) |=
+    # out:
+    map_latents: Floats3,  # (S, r, c) F of the regression over all that was fused (Eq. 6)
 ):
+    size, channels = ti.static(layout.size, layout.channels)
     for v in range(voxels):
         s = slots[v]
         if s >= 0:
-            G = ti.Vector([0.0] * (rows * size))
+            G = ti.Vector([0.0] * (layout.rows * size))
             mean = ti.Vector([0.0] * channels)
             total = map_weights[s] + sign * weights[v]
             for q in range(map_sums.shape[1]):
-                map_sums[s, q] = (
-                    map_sums[s, q]
-                    + sign * sums[v, encoded_place(q, size, channels, centered, first, encoded)]
-                )
+                new = sums[v, encoded_place(layout, q, first, encoded), 0]
+                map_sums[s, q] = map_sums[s, q] + sign * new  # `+=` would be atomic
             k = 0
             for i in range(size):
                 for j in range(i + 1):
                     G[i * size + j] = map_sums[s, k]
                     k += 1
-            for i in range(size * (channels + ti.static(int(centered)))):
+            for i in range(size * (channels + ti.static(int(layout.centered)))):
                 G[size * size + i] = map_sums[s, k]
                 k += 1
             for c in ti.static(range(channels)):
                 mean[c] = map_sums[s, k + c]
             if total > LEAST_WEIGHT:
-                solve_voxel(
-                    s,
-                    rank,
-                    size,
-                    rows,
-                    channels,
-                    centered,
-                    noise,
-                    total,
-                    mean,
-                    G,
-                    map_latents,
-                    map_weights,
-                )
+                solve_voxel(layout, s, noise, total, mean, G, map_latents, map_weights)
             else:
                 map_weights[s] = 0.0
             for half in ti.static(range(2)):

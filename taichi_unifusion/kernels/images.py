@@ -6,8 +6,8 @@ may drop a test for NaN.
 
 import taichi as ti
 
+from .arrays import Floats2, Floats3, Ints1, Ints2, row3
 from .camera import Intrinsics, Pose, lift, move, ray
-from .voxels import Floats2, Floats3, Ints1, Ints2, row3
 
 Bytes3 = ti.types.ndarray(dtype=ti.u8, ndim=3)
 PIXEL_CHUNK = 64  # pixels that one thread compacts

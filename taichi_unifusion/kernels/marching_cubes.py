@@ -4,10 +4,9 @@ Cline).
 
 import taichi as ti
 
+from .arrays import Bytes2, Floats2, Ints1, Ints2, Masks2, row3
+from .cells import CELLS, has_cell
 from .query import UNKNOWN
-from .voxels import CELLS, Floats2, Ints1, Ints2, Masks2, row3
-
-Cases2 = ti.types.ndarray(dtype=ti.u8, ndim=2)
 
 
 @ti.func
@@ -47,8 +46,7 @@ def is_supported(
 ) -> ti.i32:
     """Whether the support cell that contains the middle of a mesh cell is set."""
     cell = (2 * ijk + 1) * CELLS // (2 * resolution)
-    bit = (cell[0] * CELLS + cell[1]) * CELLS + cell[2]
-    return ti.cast((support[q, bit // 32] >> ti.cast(31 - bit % 32, ti.u32)) & ti.u32(1), ti.i32)
+    return has_cell(support, q, (cell[0] * CELLS + cell[1]) * CELLS + cell[2])
 
 
 @ti.kernel
@@ -61,9 +59,10 @@ def classify_cells(
     triangle_counts: Ints1,  # (256,)
     corner_edges: Ints2,  # (12, 4) lower corner (3) and axis of each cell edge
     edge_flags: Ints1,  # (256,) bit e: the case has a vertex on edge e
+    # in and out:
+    edges: Ints2,  # (Q, R^3) |= bit d: a vertex lies on the edge from the sample along axis d
     # out:
-    cases: Cases2,  # (Q, R^3) case of each cell, 0 where empty or unsupported
-    edges: Ints2,  # (Q, R^3) bit d: a vertex lies on the edge from the sample along axis d
+    cases: Bytes2,  # (Q, R^3) case of each cell, 0 where empty or unsupported
     triangles: Ints1,  # (Q,) triangles
 ):
     for q in range(sdf.shape[0]):
@@ -105,9 +104,9 @@ def place_vertices(
     # in:
     resolution: ti.i32,
     keys: Ints2,  # (Q, 3) lattice corners, in voxels; a cube spans [key - 1/2, key + 1/2)
-    upper: Ints2,
-    sdf: Floats2,
-    edges: Ints2,
+    upper: Ints2,  # (Q, 8)
+    sdf: Floats2,  # (Q, R^3)
+    edges: Ints2,  # (Q, R^3)
     starts: Ints1,  # (Q,) first vertex of each cube
     voxel_size: ti.f32,
     # out:
@@ -138,10 +137,10 @@ def place_vertices(
 def emit_triangles(
     # in:
     resolution: ti.i32,
-    upper: Ints2,
-    cases: Cases2,
-    edges: Ints2,
-    first: Ints2,
+    upper: Ints2,  # (Q, 8)
+    cases: Bytes2,  # (Q, R^3)
+    edges: Ints2,  # (Q, R^3)
+    first: Ints2,  # (Q, R^3)
     starts: Ints1,  # (Q,) first triangle of each cube
     triangle_counts: Ints1,  # (256,)
     triangle_edges: Ints2,  # (256, 15) cell edges, three a triangle
@@ -173,7 +172,7 @@ def sum_normals(
     vertices: Floats2,  # (V, 3)
     faces: Ints2,  # (F, 3)
     per_area: ti.f32,  # scale of the cross products, so that sums fit the integers
-    # out:
+    # in and out:
     normals: Ints2,  # (V, 3) += area-weighted face normals, fixed point: the same in any order
 ):
     for f in range(faces.shape[0]):
@@ -195,7 +194,7 @@ def join_parts(
     # in and out:
     part: Ints1,  # (V,) a vertex of the same connected part, in the end the first of them all
     # out:
-    changed: Ints1,  # [0] = 1 unless this was the last round
+    changed: Ints1,  # (1,) 1 unless this was the last round
 ):
     # the faces' corners take over the lowest number among them, also at their roots
     for f in range(faces.shape[0]):

@@ -4,29 +4,17 @@ IV-B).
 
 import taichi as ti
 
-from .cells import cell_index
+from .arrays import Bytes1, Floats2, Floats3, Ints2, Masks2, row3
+from .cells import BLOCK_CELLS, CELLS, cell_bit, cell_index, first_cell
 from .encoding import position_features
-from .voxels import (
-    BLOCK_CELLS,
-    CELLS,
-    INDEX_HALF,
-    Floats2,
-    Floats3,
-    Ints2,
-    Masks2,
-    all_within,
-    row3,
-    voxel_of,
-)
+from .index import INDEX_HALF, all_within, find, voxel_of
 
 UNKNOWN = 1e9  # signed distance where no voxel reaches
 
 
 @ti.func
 def decode(
-    rank: ti.template(),
-    channels: ti.template(),
-    centered: ti.template(),
+    layout: ti.template(),
     s: ti.i32,
     t: ti.template(),
     latents: ti.template(),
@@ -35,10 +23,11 @@ def decode(
     scale: ti.f32,
 ):
     """f_dec(t, F) of the voxel in slot s, plus its prior mean (Eq. 7)."""
+    rank, channels = ti.static(layout.rank, layout.channels)
     f = position_features(t, rank, anchors, projection, scale)
     values = ti.Vector([0.0] * channels)
     for c in ti.static(range(channels)):
-        value = latents[s, rank, c] if ti.static(centered) else 0.0
+        value = latents[s, rank, c] if ti.static(layout.centered) else 0.0
         for a in ti.static(range(rank)):
             value += f[a] * latents[s, a, c]
         values[c] = value
@@ -46,7 +35,7 @@ def decode(
 
 
 @ti.func
-def nearest_voxel(x: ti.template(), reach: ti.i32, slot: ti.template()):
+def nearest_voxel(x: ti.template(), reach: ti.i32, index: ti.template()):
     """Slot of the voxel whose centre is nearest to x within `reach` voxels along each axis, or -1,
     and its index.
     """
@@ -56,7 +45,7 @@ def nearest_voxel(x: ti.template(), reach: ti.i32, slot: ti.template()):
         edge = 2 * reach + 1
         step = ti.Vector([o // (edge * edge), o // edge % edge, o % edge]) - reach
         ijk = ti.math.clamp(home + step, -INDEX_HALF, INDEX_HALF - 1)
-        s = slot[ijk + INDEX_HALF] - 1
+        s = find(index, ijk)
         distance = (x - ijk - 0.5).norm_sqr()
         if s >= 0 and distance < nearest:
             found, at, nearest = s, ijk, distance
@@ -66,25 +55,25 @@ def nearest_voxel(x: ti.template(), reach: ti.i32, slot: ti.template()):
 @ti.kernel
 def query_points(
     # in:
-    rank: ti.template(),
-    channels: ti.template(),
-    centered: ti.template(),
-    blend: ti.template(),  # all doubled voxels that contain the point, with tent weights; else its own voxel only
+    layout: ti.template(),
+    # all doubled voxels that contain the point, with tent weights; else its own voxel only
+    blend: ti.template(),
     points: Floats2,  # (N, 3) world [m]
     per_meter: ti.f32,
-    slot: ti.template(),
+    index: ti.template(),
     latents: Floats3,  # (S, l [+ 1], c)
-    anchors: Floats2,
-    projection: Floats2,
+    anchors: Floats2,  # (3, A)
+    projection: Floats2,  # (l, A)
     scale: ti.f32,
-    reach: ti.i32,  # points that no voxel covers take the value of the nearest one within so many voxels
+    # points that no voxel covers take the value of the nearest one within this many voxels
+    reach: ti.i32,
     # out:
     values: Floats2,  # (N, c) 0 where there is none
-    valid: ti.types.ndarray(dtype=ti.u8, ndim=1),  # (N,) = 1 where a voxel covers the point
+    valid: Bytes1,  # (N,) = 1 where a voxel covers the point
 ):
     for n in range(points.shape[0]):
         x = row3(points, n) * per_meter
-        total = ti.Vector([0.0] * channels)
+        total = ti.Vector([0.0] * layout.channels)
         weight, covered = 0.0, 0
         if all_within(x, INDEX_HALF - 1.0):
             corner = voxel_of(x - 0.5) if ti.static(blend) else voxel_of(x)
@@ -93,9 +82,9 @@ def query_points(
                 ijk, s = corner, -1
                 if o < covering:
                     ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
-                    s = slot[ijk + INDEX_HALF] - 1
+                    s = find(index, ijk)
                 elif weight == 0 and reach > 0:
-                    s, ijk = nearest_voxel(x, reach, slot)
+                    s, ijk = nearest_voxel(x, reach, index)
                 if s >= 0:
                     t = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
                     tent = 1.0
@@ -104,39 +93,37 @@ def query_points(
                             tent *= ti.max(1.0 - 2.0 * ti.abs(t[d]), 0.0)
                         # on the border of the only voxel there is, its value still counts
                         tent = ti.max(tent, 1e-6)
-                    total += tent * decode(
-                        rank, channels, centered, s, t, latents, anchors, projection, scale
-                    )
+                    total += tent * decode(layout, s, t, latents, anchors, projection, scale)
                     weight += tent
                     covered += ti.cast(o < covering, ti.i32)
         valid[n] = ti.cast(covered > 0, ti.u8)
-        for c in ti.static(range(channels)):
+        for c in ti.static(range(layout.channels)):
             values[n, c] = total[c] / ti.max(weight, 1e-12)
 
 
 @ti.func
-def corner_slot(keys: ti.template(), q: ti.i32, o: ti.i32, slot: ti.template()) -> ti.i32:
+def corner_slot(keys: ti.template(), q: ti.i32, o: ti.i32, index: ti.template()) -> ti.i32:
     """Slot of voxel o of the eight around lattice corner q, or -1."""
     ijk = row3(keys, q) - ti.Vector([1 - o // 4, 1 - o // 2 % 2, 1 - o % 2])
-    return slot[ti.math.clamp(ijk, -INDEX_HALF, INDEX_HALF - 1) + INDEX_HALF] - 1
+    return find(index, ti.math.clamp(ijk, -INDEX_HALF, INDEX_HALF - 1))
 
 
 @ti.kernel
 def corner_support(
     # in:
     keys: Ints2,  # (Q, 3) lattice corners; the cube of corner q spans the centres of its eight voxels
-    slot: ti.template(),
+    index: ti.template(),
     map_masks: Masks2,  # (S, 2) support of each voxel's cells
-    # a cell with at least so many of its 26 neighbours supported is taken in: pinholes close, rims
-    # stay
+    # a cell with at least this many of its 26 neighbours supported is taken in: pinholes close,
+    # rims stay
     closing: ti.i32,
     # out:
-    support: Masks2,  # (Q, 2) supported cells of the cube, as `mark_cells` numbers them
+    support: Masks2,  # (Q, 2) supported cells of the cube, numbered as those of a voxel
 ):
     for q in range(keys.shape[0]):
         around = ti.Vector([0] * BLOCK_CELLS)
         for o in range(8):
-            s = corner_slot(keys, q, o, slot)
+            s = corner_slot(keys, q, o, index)
             if s >= 0:
                 # A voxel's cells 0..3 along an axis are cells -2..1 (upper voxel: 2..5) of the cube
                 # that starts at its centre.
@@ -144,19 +131,19 @@ def corner_support(
                 for half in range(2):
                     mask = map_masks[s, half]
                     while mask != 0:
-                        k = ti.math.clz(ti.cast(mask, ti.i32))
-                        mask ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
+                        k = first_cell(mask)
+                        mask ^= cell_bit(k)
                         at = base + cell_index(half * 32 + k)
                         for i in range(ti.max(at[0] - 1, 0), ti.min(at[0] + 2, CELLS)):
                             for j in range(ti.max(at[1] - 1, 0), ti.min(at[1] + 2, CELLS)):
-                                for l in range(ti.max(at[2] - 1, 0), ti.min(at[2] + 2, CELLS)):
-                                    itself = i == at[0] and j == at[1] and l == at[2]
-                                    around[(i * CELLS + j) * CELLS + l] += 27 if itself else 1
+                                for m in range(ti.max(at[2] - 1, 0), ti.min(at[2] + 2, CELLS)):
+                                    itself = i == at[0] and j == at[1] and m == at[2]
+                                    around[(i * CELLS + j) * CELLS + m] += 27 if itself else 1
         for half in range(2):
             reached = ti.u32(0)
             for k in range(32):
                 if around[half * 32 + k] >= ti.min(closing, 27):
-                    reached |= ti.u32(1) << ti.cast(31 - k, ti.u32)
+                    reached |= cell_bit(k)
             support[q, half] = reached
 
 
@@ -165,7 +152,7 @@ def sdf_grid(
     # in:
     rank: ti.template(),
     keys: Ints2,  # (Q, 3) lattice corners
-    slot: ti.template(),
+    index: ti.template(),
     latents: Floats3,  # (S, l, 1)
     basis: Floats2,  # (R^3, 8 l) tent weight times f_posi of each voxel, at the R^3 samples of a cube
     tents: Floats2,  # (R^3, 8)
@@ -176,7 +163,7 @@ def sdf_grid(
         F = ti.Vector([0.0] * (8 * rank))
         present = ti.Vector([0.0] * 8)
         for o in range(8):
-            s = corner_slot(keys, q, o, slot)
+            s = corner_slot(keys, q, o, index)
             if s >= 0:
                 present[o] = 1.0
                 for a in range(rank):

@@ -5,17 +5,18 @@ sample in the doubled voxel, W the number of points behind it. The targets Y rid
 rows of P^T, so that one Gram product gives both P^T W P and Y^T W P, and the forward half of the
 solve falls out of the Cholesky factorisation.
 
-Sizes are multiples of 4 (`size` for l, `rows` for l plus targets; padding is zero): everything runs
-in 4x4 patches that stay in registers. A *worker* is a thread with a scratch tile of its own that
-takes a run of voxels.
+Sizes stand in a `Layout`: multiples of 4, so that everything runs in 4x4 patches that stay in
+registers. A *worker* is a thread with a scratch tile of its own that takes a run of voxels.
 """
 
 import taichi as ti
 
+from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, row3
+from .cells import CELLS, cell_bit, cells_before, first_cell
 from .encoding import position_features, position_gradient
-from .voxels import CELLS, INDEX_HALF, Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, row3
+from .index import INDEX_HALF, in_range
+from .layout import PATCH
 
-PATCH = 4
 TILE = 128  # samples whose features are held at once: the products run over this contiguous axis
 
 
@@ -28,8 +29,7 @@ def neighbor_step(o: ti.i32):
 @ti.kernel
 def find_neighbors(
     # in:
-    stamp: ti.template(),
-    block: ti.template(),
+    index: ti.template(),
     frame: ti.i32,
     blocks: ti.i32,
     keys: Ints2,  # (B, 3)
@@ -41,16 +41,14 @@ def find_neighbors(
             neighbors[b, o] = -1
         neighbors[b, 13] = b
     for b in range(blocks):
-        for o in range(13):  # the other half of them, seen from the other side
+        # neighbours 14..26 by symmetry: neighbour o of b has b as its neighbour 26 - o
+        for o in range(13):
             ijk = row3(keys, b) + neighbor_step(o)
             found = -1
-            if (
-                ijk.min() >= -INDEX_HALF
-                and ijk.max() < INDEX_HALF
-                and stamp[ijk + INDEX_HALF] == frame
-            ):
-                found = block[ijk + INDEX_HALF]
-                neighbors[found, 26 - o] = b
+            if in_range(ijk):
+                if index.stamp[ijk + INDEX_HALF] == frame:
+                    found = index.block[ijk + INDEX_HALF]
+                    neighbors[found, 26 - o] = b
             neighbors[b, o] = found
 
 
@@ -65,8 +63,7 @@ def cell_row(cell: ti.i32, step: ti.template()) -> ti.i32:
 
 @ti.func
 def add_tile(
-    size: ti.template(),
-    rows: ti.template(),
+    layout: ti.template(),
     worker: ti.i32,
     filled: ti.i32,
     tiles: ti.template(),
@@ -75,6 +72,7 @@ def add_tile(
     """G += P W P^T over the `filled` samples in a worker's tile, whose columns are zero up to the
     next multiple of 16.
     """
+    size, rows = ti.static(layout.size, layout.rows)
     length = (filled + 15) // 16 * 16
     for i in range(rows // PATCH):
         for j in range(ti.min(i + 1, size // PATCH)):
@@ -92,8 +90,7 @@ def add_tile(
 
 @ti.func
 def flush(
-    size: ti.template(),
-    rows: ti.template(),
+    layout: ti.template(),
     worker: ti.i32,
     filled: ti.i32,
     tiles: ti.template(),
@@ -102,32 +99,31 @@ def flush(
     """Add what a worker's tile holds to G, first clearing the columns that round it up to a
     multiple of 16.
     """
-    for row in range(rows):
+    for row in range(layout.rows):
         for k in range(filled, (filled + 15) // 16 * 16):
             tiles[worker, row, k] = 0.0
-    add_tile(size, rows, worker, filled, tiles, G)
+    add_tile(layout, worker, filled, tiles, G)
 
 
 @ti.func
-def cholesky_solve(
-    size: ti.template(), rows: ti.template(), width: ti.template(), noise: ti.f32, G: ti.template()
-):
-    """Solve (G + noise I) F = R, where R^T stands in the `width` rows of G below its first `size`;
-    F^T replaces it.
+def cholesky_solve(layout: ti.template(), noise: ti.f32, G: ti.template()):
+    """Solve (G + noise I) F = R, where R^T stands in the rows of the targets below P^T P; F^T
+    replaces it.
     """
-    for J in range(size // PATCH):
-        for I in range(J, rows // PATCH):
+    size, rows, width = ti.static(layout.size, layout.rows, layout.channels)
+    for column in range(size // PATCH):
+        for row in range(column, rows // PATCH):
             s = ti.Vector([0.0] * (PATCH * PATCH))
             for a in ti.static(range(PATCH)):
                 for b in ti.static(range(PATCH)):
-                    s[a * PATCH + b] = G[(I * PATCH + a) * size + J * PATCH + b]
-            for k in range(PATCH * J):
+                    s[a * PATCH + b] = G[(row * PATCH + a) * size + column * PATCH + b]
+            for k in range(PATCH * column):
                 for a in ti.static(range(PATCH)):
                     for b in ti.static(range(PATCH)):
                         s[a * PATCH + b] -= (
-                            G[(I * PATCH + a) * size + k] * G[(J * PATCH + b) * size + k]
+                            G[(row * PATCH + a) * size + k] * G[(column * PATCH + b) * size + k]
                         )
-            if I == J:  # factor the patch; its diagonal keeps the inverse pivots
+            if row == column:  # factor the patch; its diagonal keeps the inverse pivots
                 for c in ti.static(range(PATCH)):
                     pivot = s[c * PATCH + c] + noise
                     for k in ti.static(range(c)):
@@ -142,12 +138,13 @@ def cholesky_solve(
                     for a in ti.static(range(PATCH)):
                         for k in ti.static(range(c)):
                             s[a * PATCH + c] -= (
-                                s[a * PATCH + k] * G[(J * PATCH + c) * size + J * PATCH + k]
+                                s[a * PATCH + k]
+                                * G[(column * PATCH + c) * size + column * PATCH + k]
                             )
-                        s[a * PATCH + c] *= G[(J * PATCH + c) * size + J * PATCH + c]
+                        s[a * PATCH + c] *= G[(column * PATCH + c) * size + column * PATCH + c]
             for a in ti.static(range(PATCH)):
                 for b in ti.static(range(PATCH)):
-                    G[(I * PATCH + a) * size + J * PATCH + b] = s[a * PATCH + b]
+                    G[(row * PATCH + a) * size + column * PATCH + b] = s[a * PATCH + b]
     for back in range(size):
         i = size - 1 - back
         s = ti.Vector([0.0] * width)
@@ -163,14 +160,11 @@ def cholesky_solve(
 @ti.func
 def solve_voxel(
     # in:
+    layout: ti.template(),
     v: ti.i32,
-    rank: ti.template(),
-    size: ti.template(),
-    rows: ti.template(),
-    channels: ti.template(),
-    centered: ti.template(),
     noise: ti.f32,
     weight: ti.f32,
+    # in and out:
     mean: ti.template(),
     G: ti.template(),
     # out:
@@ -180,19 +174,20 @@ def solve_voxel(
     """F of one voxel from its Gram matrix; with a prior mean m, regress y - m and keep m as one
     more row.
     """
-    # P^T W (Y - 1 m) = R - (P^T W 1) m; the row of ones follows the targets
-    if ti.static(centered):
+    size, rank, channels = ti.static(layout.size, layout.rank, layout.channels)
+    if ti.static(layout.centered):
+        # P^T W (Y - 1 m) = R - (P^T W 1) m; the row of ones follows the targets
         for c in ti.static(range(channels)):
             mean[c] /= weight
         for a in range(size):
             for c in ti.static(range(channels)):
                 G[(size + c) * size + a] -= G[(size + channels) * size + a] * mean[c]
-    cholesky_solve(size, rows, channels, noise, G)
+    cholesky_solve(layout, noise, G)
     weights[v] = weight
     for a in range(rank):
         for c in ti.static(range(channels)):
             latents[v, a, c] = G[(size + c) * size + a]
-    if ti.static(centered):
+    if ti.static(layout.centered):
         for c in ti.static(range(channels)):
             latents[v, rank, c] = mean[c]
 
@@ -200,10 +195,8 @@ def solve_voxel(
 @ti.func
 def keep_sums(
     # in:
+    layout: ti.template(),
     v: ti.i32,
-    size: ti.template(),
-    channels: ti.template(),
-    centered: ti.template(),
     weight: ti.f32,
     mean: ti.template(),
     G: ti.template(),
@@ -211,59 +204,62 @@ def keep_sums(
     sums: ti.template(),
     weights: ti.template(),
 ):
-    """What the regression of one voxel sums over its samples, in one row: P^T W P's lower half, Y^T
-    W P, 1^T W P, Y^T W 1.
+    """What the regression of one voxel sums over its samples, in one row: the lower half of
+    P^T W P, then Y^T W P, 1^T W P and Y^T W 1.
     """
+    size = ti.static(layout.size)
     k = 0
     for i in range(size):
         for j in range(i + 1):
-            sums[v, k] = G[i * size + j]
+            sums[v, k, 0] = G[i * size + j]
             k += 1
-    for i in range(size * (channels + ti.static(int(centered)))):
-        sums[v, k] = G[size * size + i]
+    for i in range(size * (layout.channels + ti.static(int(layout.centered)))):
+        sums[v, k, 0] = G[size * size + i]
         k += 1
-    for c in ti.static(range(channels)):
-        sums[v, k + c] = mean[c]
+    for c in ti.static(range(layout.channels)):
+        sums[v, k + c, 0] = mean[c]
     weights[v] = weight
+
+
+def worker_stride() -> int:
+    """Loop iterations a worker: Taichi cuts a CPU loop into chunks of at least 512."""
+    return 512 if ti.lang.impl.current_cfg().arch in (ti.x64, ti.arm64) else 1
 
 
 @ti.kernel
 def encode_cells(
     # in:
-    rank: ti.template(),
-    size: ti.template(),
-    rows: ti.template(),
-    channels: ti.template(),
-    centered: ti.template(),
-    derivatives: ti.template(),
-    solve: ti.template(),  # for F; else leave the sums, for `fuse_information`
+    layout: ti.template(),
     blocks: ti.i32,
     neighbors: Ints2,  # (B, 27)
     masks: Masks2,  # (B, 2) occupied cells
     window: Masks2,  # (27, 2) cells of each neighbour that count
     totals: Ints1,  # (B,) points in the block itself
     starts: Ints1,  # (B,) first row of each block in `cells`
-    cells: Floats2,  # (M, 1 + c [+ 3]) root of the count, then the mean targets, and normals if `derivatives`, times it
+    # (M, 1 + c [+ 3]) root of the count, then the mean targets, and normals if `derivatives`, times
+    # it
+    cells: Floats2,
     # (8^3, 1 or 4, size) f_posi, and 1/2 df/dt if `derivatives`, at the cell centres of a doubled
     # voxel
     features: Floats3,
     minimum: ti.i32,  # blocks with fewer points are not encoded
     noise: ti.f32,  # d of Eq. 6, in units of the kernel's variance
-    workers: ti.i32,
-    stride: ti.i32,  # loop iterations a worker: the CPU cuts loops into chunks of at least 512
     # out:
-    tiles: ti.template(),  # (W, rows, TILE) scratch
-    latents: Floats3,  # (B, l [+ 1], c) F, then the prior mean
+    tiles: ti.template(),  # (W, rows, TILE) scratch of W workers
     weights: Floats1,  # (B,) points in the doubled voxel, 0 where not encoded
-    sums: Floats2,  # (B, q) as `keep_sums`
+    # (B, l [+ 1], c) F, then the prior mean; (B, q, 1) the sums of `keep_sums` for fusion by
+    # information
+    encoded: Floats3,
 ):
+    size, channels = ti.static(layout.size, layout.channels)
+    stride, workers = ti.static(worker_stride(), tiles.shape[0])
     for i in range(workers * stride):
         if i % stride == 0:
             worker = i // stride
             for v in range(worker * blocks // workers, (worker + 1) * blocks // workers):
                 weights[v] = 0.0
                 if totals[v] >= minimum:
-                    G = ti.Vector([0.0] * (rows * size))
+                    G = ti.Vector([0.0] * (layout.rows * size))
                     mean = ti.Vector([0.0] * channels)
                     filled, weight = 0, 0.0
                     for o in range(27):
@@ -274,11 +270,9 @@ def encode_cells(
                                 occupied = masks[b, half]
                                 wanted = occupied & window[o, half]
                                 while wanted != 0:
-                                    k = ti.math.clz(ti.cast(wanted, ti.i32))
-                                    wanted ^= ti.u32(1) << ti.cast(31 - k, ti.u32)
-                                    n = first + ti.math.popcnt(
-                                        (occupied >> 1) >> ti.cast(31 - k, ti.u32)
-                                    )
+                                    k = first_cell(wanted)
+                                    wanted ^= cell_bit(k)
+                                    n = first + cells_before(occupied, k)
                                     at = cell_row(half * 32 + k, step)
                                     root = cells[n, 0]
                                     for a in ti.static(range(size)):
@@ -287,11 +281,11 @@ def encode_cells(
                                         y = cells[n, 1 + c]
                                         tiles[worker, size + c, filled] = y
                                         mean[c] += y * root
-                                    if ti.static(centered):
+                                    if ti.static(layout.centered):
                                         tiles[worker, size + channels, filled] = root
                                     filled += 1
-                                    # Eq. 16: one more row an axis, its target the normal
-                                    if ti.static(derivatives):
+                                    if ti.static(layout.derivatives):
+                                        # Eq. 16: one more row an axis, its target the normal
                                         for axis in ti.static(range(3)):
                                             for a in ti.static(range(size)):
                                                 tiles[worker, a, filled] = (
@@ -301,41 +295,21 @@ def encode_cells(
                                             filled += 1
                                     weight += root * root
                                     if filled > TILE - 4:
-                                        flush(size, rows, worker, filled, tiles, G)
+                                        flush(layout, worker, filled, tiles, G)
                                         filled = 0
                                 first += ti.cast(ti.math.popcnt(occupied), ti.i32)
                     if filled > 0:
-                        flush(size, rows, worker, filled, tiles, G)
-                    if ti.static(solve):
-                        solve_voxel(
-                            v,
-                            rank,
-                            size,
-                            rows,
-                            channels,
-                            centered,
-                            noise,
-                            weight,
-                            mean,
-                            G,
-                            latents,
-                            weights,
-                        )
+                        flush(layout, worker, filled, tiles, G)
+                    if ti.static(layout.information):
+                        keep_sums(layout, v, weight, mean, G, encoded, weights)
                     else:
-                        keep_sums(v, size, channels, centered, weight, mean, G, sums, weights)
+                        solve_voxel(layout, v, noise, weight, mean, G, encoded, weights)
 
 
 @ti.kernel
 def encode_points(
     # in:
-    rank: ti.template(),
-    size: ti.template(),
-    rows: ti.template(),
-    channels: ti.template(),
-    centered: ti.template(),
-    derivatives: ti.template(),
-    solve: ti.template(),
-    blocks: ti.i32,
+    layout: ti.template(),
     keys: Ints2,  # (B, 3)
     neighbors: Ints2,  # (B, 27)
     starts: Ints1,  # (B + 1,) first sample of each block
@@ -346,23 +320,23 @@ def encode_points(
     scale: ti.f32,
     minimum: ti.i32,  # doubled voxels with fewer samples are not encoded
     noise: ti.f32,
-    workers: ti.i32,
-    stride: ti.i32,
-    # out:
-    tiles: ti.template(),
-    latents: Floats3,
-    weights: Floats1,
-    sums: Floats2,  # as encode_cells
+    # out: as encode_cells
+    tiles: ti.template(),  # (W, rows, TILE)
+    weights: Floats1,  # (B,)
+    encoded: Floats3,  # (B, l [+ 1], c) or (B, q, 1)
 ):
+    rank, size, channels = ti.static(layout.rank, layout.size, layout.channels)
+    stride, workers = ti.static(worker_stride(), tiles.shape[0])
+    blocks = starts.shape[0] - 1
     for i in range(workers * stride):
         if i % stride == 0:
             worker = i // stride
-            for row in range(rows):
+            for row in range(layout.rows):
                 for k in range(TILE):
                     tiles[worker, row, k] = 0.0
             for v in range(worker * blocks // workers, (worker + 1) * blocks // workers):
                 weights[v] = 0.0
-                G = ti.Vector([0.0] * (rows * size))
+                G = ti.Vector([0.0] * (layout.rows * size))
                 mean = ti.Vector([0.0] * channels)
                 ijk = row3(keys, v)
                 filled, weight = 0, 0.0
@@ -378,39 +352,27 @@ def encode_points(
                                 for c in ti.static(range(channels)):
                                     tiles[worker, size + c, filled] = targets[n, c]
                                     mean[c] += targets[n, c]
-                                if ti.static(centered):
+                                if ti.static(layout.centered):
                                     tiles[worker, size + channels, filled] = 1.0
                                 filled += 1
-                                if ti.static(derivatives):
+                                if ti.static(layout.derivatives):
                                     for axis in range(3):
                                         g = position_gradient(
                                             t, axis, rank, anchors, projection, scale
                                         )
                                         for a in ti.static(range(rank)):
-                                            tiles[worker, a, filled] = 0.5 * g[a]  # d/dx = 1/2 d/dt
+                                            # d/dx = 1/2 d/dt
+                                            tiles[worker, a, filled] = 0.5 * g[a]
                                         tiles[worker, size, filled] = targets[n, 1 + axis]
                                         filled += 1
                                 weight += 1.0
                                 if filled > TILE - 4:
-                                    flush(size, rows, worker, filled, tiles, G)
+                                    flush(layout, worker, filled, tiles, G)
                                     filled = 0
                 if filled > 0:
-                    flush(size, rows, worker, filled, tiles, G)
+                    flush(layout, worker, filled, tiles, G)
                 if weight >= minimum:
-                    if ti.static(solve):
-                        solve_voxel(
-                            v,
-                            rank,
-                            size,
-                            rows,
-                            channels,
-                            centered,
-                            noise,
-                            weight,
-                            mean,
-                            G,
-                            latents,
-                            weights,
-                        )
+                    if ti.static(layout.information):
+                        keep_sums(layout, v, weight, mean, G, encoded, weights)
                     else:
-                        keep_sums(v, size, channels, centered, weight, mean, G, sums, weights)
+                        solve_voxel(layout, v, noise, weight, mean, G, encoded, weights)

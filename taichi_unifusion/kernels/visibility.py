@@ -8,43 +8,30 @@ those that read depth behind it.
 
 import taichi as ti
 
-from .cells import cell_center
-from .voxels import (
-    BLOCK_CELLS,
-    CELLS,
-    INDEX_HALF,
-    Floats1,
-    Floats2,
-    Floats3,
-    Ints1,
-    Ints2,
-    Masks2,
-    row3,
-    voxel_of,
-)
-
-Votes2 = ti.types.ndarray(dtype=ti.i8, ndim=2)
+from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, Votes2, row3
+from .camera import Intrinsics, Pose
+from .cells import BLOCK_CELLS, CELLS, cell_center, cell_in_lattice, has_cell
+from .index import INDEX_HALF, find, voxel_of
 
 MOST_VOTES = 127  # votes that a cell can hold, for or against
 SLACK_VOXELS = 0.5  # a reading this far behind a point passes through it [voxels]...
 SLACK_NOISE = 0.003  # ...plus this much [1/m] times its depth squared: two sigma of a Kinect
 GRAZING = 0.1  # cosine; rays flatter on a surface than this cannot say that they pass through it
 ALONE = 0.45  # the surface of a cell lies within this distance of its centre [voxels]
-LEAST_TENT = 1e-6  # of the cells around a point; with less they say nothing
+LEAST_TENT = 1e-6  # smallest sum of tent weights that counts; below it the default 1 is used
 FLAT = 0.2  # a field with a smaller slope than this has no surface to speak of
 
 
 @ti.func
-def read_behind(
-    p: ti.template(), depth: ti.template(), fx: ti.f32, fy: ti.f32, cx: ti.f32, cy: ti.f32
-):
+def read_behind(p: ti.template(), depth: ti.template(), K: ti.template()):
     """How far behind p [m, camera] the reading of its pixel lies [m], and whether there is a
     reading.
     """
     behind, known = 0.0, False
     if p[2] > 0:
         per_depth = 1.0 / p[2]
-        u, v = p[0] * per_depth * fx + cx + 0.5, p[1] * per_depth * fy + cy + 0.5
+        u = p[0] * per_depth * K[0] + K[2] + 0.5
+        v = p[1] * per_depth * K[1] + K[3] + 0.5
         # before the cast, which could overflow
         if u >= 0 and v >= 0 and u < depth.shape[1] and v < depth.shape[0]:
             reading = depth[ti.cast(v, ti.i32), ti.cast(u, ti.i32)]
@@ -80,16 +67,14 @@ def seen_beside(
     p: ti.template(),
     slack: ti.f32,
     depth: ti.template(),
-    fx: ti.f32,
-    fy: ti.f32,
-    cx: ti.f32,
-    cy: ti.f32,
+    K: ti.template(),
 ):
     """Whether a pixel beside that of p [m, camera] reads its depth: on glass and dark things,
     readings come and go.
     """
     seen = False
-    u, v = p[0] / p[2] * fx + cx + 0.5, p[1] / p[2] * fy + cy + 0.5
+    u = p[0] / p[2] * K[0] + K[2] + 0.5
+    v = p[1] / p[2] * K[1] + K[3] + 0.5
     if u >= 1 and v >= 1 and u < depth.shape[1] - 1 and v < depth.shape[0] - 1:
         for o in range(9):
             reading = depth[ti.cast(v, ti.i32) + o // 3 - 1, ti.cast(u, ti.i32) + o % 3 - 1]
@@ -103,23 +88,20 @@ def surface_vote(
     normal: ti.template(),
     voxel_size: ti.f32,
     depth: ti.template(),
-    fx: ti.f32,
-    fy: ti.f32,
-    cx: ti.f32,
-    cy: ti.f32,
+    K: ti.template(),
 ):
     """1 where a reading saw a point p of the surface [m, camera], -1 where it passed through, else
     0.
     """
-    behind, known = read_behind(p, depth, fx, fy, cx, cy)
+    behind, known = read_behind(p, depth, K)
     cosine = ti.max(ti.abs(normal.dot(p)) / p.norm(), 0.02)
     # depth across one pixel
-    pixel = p[2] / fx * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine
+    pixel = p[2] / K[0] * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine
     slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2] + pixel
     vote = 0
     if not known:
         if p[2] > 0:
-            vote = ti.cast(seen_beside(p, slack, depth, fx, fy, cx, cy), ti.i32)
+            vote = ti.cast(seen_beside(p, slack, depth, K), ti.i32)
     elif behind > slack:
         vote = -1 if cosine > GRAZING else 0
     elif behind > -slack:
@@ -138,26 +120,24 @@ def vote_cells(
     features: Floats3,  # (64, 4, l) f_posi and its gradient by voxel units at the cells' centres
     voxel_size: ti.f32,
     depth: Floats2,  # (H, W) [m], 0: no reading
-    fx: ti.f32,
-    fy: ti.f32,
-    cx: ti.f32,
-    cy: ti.f32,
-    T_camera_world: Floats2,  # (3, 4)
+    K: Intrinsics,
+    T_camera_world: Pose,  # [m]
     sign: ti.i32,  # 1; -1 takes the frame's votes back
-    # out:
-    evidence: Votes2,  # (S, 64) += 1 where the frame saw the cell's surface, -= 1 where it saw through the cell
+    # in and out:
+    # (S, 64) += 1 where the frame saw the cell's surface, -= 1 where it saw through the cell
+    evidence: Votes2,
 ):
     for s in range(voxels):
         # world [voxels] -> camera [m]
         R = ti.Matrix([[T_camera_world[i, j] * voxel_size for j in range(3)] for i in range(3)])
         corner = R @ row3(keys, s) + ti.Vector([T_camera_world[i, 3] for i in ti.static(range(3))])
         center = corner + R @ ti.Vector([0.5, 0.5, 0.5])
-        z, around = (
-            ti.max(center[2], 1e-3),
-            1.5 * voxel_size * ti.max(fx, fy) / ti.max(center[2] - voxel_size, 1e-3),
-        )
+        z = ti.max(center[2], 1e-3)
         # what votes lies within a voxel's edge of its centre
-        u, v = center[0] / z * fx + cx, center[1] / z * fy + cy
+        focal = ti.max(K[0], K[1])
+        around = 1.5 * voxel_size * focal / ti.max(center[2] - voxel_size, 1e-3)
+        u = center[0] / z * K[0] + K[2]
+        v = center[1] / z * K[1] + K[3]
         in_image = (
             u > -around
             and v > -around
@@ -169,11 +149,12 @@ def vote_cells(
             for a in range(rank):
                 F[a] = latents[s, a, 0]
             for cell in range(BLOCK_CELLS):
-                supported = (masks[s, cell >> 5] >> ti.cast(31 - (cell & 31), ti.u32)) & 1
                 vote = 0
-                if supported == 0:  # nothing seen here yet, but later frames may invent some
+                # no surface here yet; record that this frame saw through, in case a later frame
+                # extrapolates one
+                if has_cell(masks, s, cell) == 0:
                     p = corner + R @ cell_center(cell)
-                    behind, known = read_behind(p, depth, fx, fy, cx, cy)
+                    behind, known = read_behind(p, depth, K)
                     if known and behind > SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]:
                         vote = -1
                 else:
@@ -184,10 +165,7 @@ def vote_cells(
                             R @ normal / voxel_size,
                             voxel_size,
                             depth,
-                            fx,
-                            fy,
-                            cx,
-                            cy,
+                            K,
                         )
                 if vote != 0:
                     add_votes(evidence, s, cell, sign * vote)
@@ -199,14 +177,14 @@ def vote_support(
     blocks: ti.i32,
     keys: Ints2,  # (B, 3)
     support: Masks2,  # (B, 2) cells that the frame supports
-    slot: ti.template(),
+    index: ti.template(),
     sign: ti.i32,
-    # out:
+    # in and out:
     evidence: Votes2,  # (S, 64) += 1 where the frame supports the cell: it has no rays to ask
 ):
     for b, cell in ti.ndrange(blocks, BLOCK_CELLS):
-        s = slot[row3(keys, b) + INDEX_HALF] - 1
-        if s >= 0 and (support[b, cell // 32] >> ti.cast(31 - cell % 32, ti.u32)) & 1 != 0:
+        s = find(index, row3(keys, b))
+        if s >= 0 and has_cell(support, b, cell) != 0:
             add_votes(evidence, s, cell, sign)
 
 
@@ -215,7 +193,7 @@ def add_evidence(
     # in:
     slots: Ints1,  # (N,)
     evidence: Votes2,  # (N, 64)
-    # out:
+    # in and out:
     map_evidence: Votes2,  # (S, 64) += evidence
 ):
     for n, cell in ti.ndrange(slots.shape[0], BLOCK_CELLS):
@@ -227,12 +205,12 @@ def interpolate_evidence(
     # in:
     points: Floats2,  # (N, 3) world [m]
     per_meter: ti.f32,
-    slot: ti.template(),
+    index: ti.template(),
     masks: Masks2,  # (S, 2)
     evidence: Votes2,  # (S, 64)
     # out:
-    # (N,) between the cells around that have support or are seen through; 1 where none is, as if
-    # seen once
+    # (N,) trilinear mean over the 8 cells around, of those with support or negative evidence; 1 if
+    # there is none
     values: Floats1,
 ):
     for n in range(points.shape[0]):
@@ -243,11 +221,10 @@ def interpolate_evidence(
         for o in range(8):
             step = ti.Vector([o // 4, o // 2 % 2, o % 2])
             at = corner + step
-            s = slot[ti.math.clamp(at >> 2, -INDEX_HALF, INDEX_HALF - 1) + INDEX_HALF] - 1
+            s = find(index, ti.math.clamp(at >> 2, -INDEX_HALF, INDEX_HALF - 1))
             if s >= 0:
-                cell = ((at[0] & 3) * CELLS + (at[1] & 3)) * CELLS + (at[2] & 3)
-                supported = (masks[s, cell // 32] >> ti.cast(31 - cell % 32, ti.u32)) & 1 != 0
-                if supported or evidence[s, cell] < 0:
+                cell = cell_in_lattice(at)
+                if has_cell(masks, s, cell) != 0 or evidence[s, cell] < 0:
                     tent = 1.0
                     for d in ti.static(range(3)):
                         tent *= part[d] if step[d] == 1 else 1.0 - part[d]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..maps import LatentMap
+from ..maps import FeatureMap
 from ..networks.encoders import TextEncoder
 from ..types import Mesh
 from .prompts import LOGIT_SCALE, TEMPLATES, competitors, embed, relevance
@@ -39,7 +39,7 @@ class Answer:
 
 
 def ask(
-    features: LatentMap,
+    features: FeatureMap,
     mesh: Mesh,
     encoder: TextEncoder,
     texts: Sequence[str],
@@ -72,7 +72,7 @@ def ask(
 
 
 def _scores(
-    features: LatentMap, points: NDArray, both: NDArray, distances: NDArray
+    features: FeatureMap, points: NDArray, both: NDArray, distances: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Similarity and relevance (N, n) of n queries, which come before their m rivals in `both`, at
     `distances` (n, m).
@@ -102,7 +102,7 @@ class Segmentation:
 
 
 def segment(
-    features: LatentMap,
+    features: FeatureMap,
     points: NDArray,
     encoder: TextEncoder,
     names: Sequence[str],

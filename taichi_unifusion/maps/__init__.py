@@ -10,19 +10,22 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
+from ..errors import MapCorrupt
+from ..files.maps import read_map
+
 if TYPE_CHECKING:
     from .base_map import BaseMap, Integration
-    from .latent_map import LatentMap
+    from .feature_map import FeatureMap
     from .property_group import PropertyGroup
     from .property_map import PropertyMap
-    from .settings import LatentSettings, MapSettings, PropertySettings, SurfaceSettings
+    from .settings import FeatureSettings, MapSettings, PropertySettings, SurfaceSettings
     from .surface_map import SurfaceMap
 
 __all__ = [
     "BaseMap",
     "Integration",
-    "LatentMap",
-    "LatentSettings",
+    "FeatureMap",
+    "FeatureSettings",
     "MapSettings",
     "PropertyGroup",
     "PropertyMap",
@@ -33,12 +36,21 @@ __all__ = [
 ]
 
 
+MAP_KINDS = {  # kind, as in files -> module here, class
+    "surface": ("surface_map", "SurfaceMap"),
+    "property": ("property_map", "PropertyMap"),
+    "latent": ("feature_map", "FeatureMap"),
+}
+
+
 def load_map(path: str | Path) -> BaseMap:
     """The map in a file, of whatever kind it is; raises MapCorrupt or FileError."""
-    # a kind of map registers itself when its module loads
-    for module in ("property_map", "latent_map", "surface_map"):
-        import_module(f".{module}", __name__)
-    return __getattr__("BaseMap").load(path)
+    tensors, manifest = read_map(Path(path))
+    kind = manifest.get("kind")
+    if kind not in MAP_KINDS:
+        raise MapCorrupt(f"{path}: holds a map of kind '{kind}', not one of {', '.join(MAP_KINDS)}")
+    module, name = MAP_KINDS[kind]
+    return getattr(import_module(f".{module}", __name__), name).from_file(path, tensors, manifest)
 
 
 __getattr__, __dir__, _ = lazy_loader.attach(
@@ -48,7 +60,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "property_map": ["PropertyMap"],
         "property_group": ["PropertyGroup"],
         "surface_map": ["SurfaceMap"],
-        "latent_map": ["LatentMap"],
-        "settings": ["LatentSettings", "MapSettings", "PropertySettings", "SurfaceSettings"],
+        "feature_map": ["FeatureMap"],
+        "settings": ["FeatureSettings", "MapSettings", "PropertySettings", "SurfaceSettings"],
     },
 )

@@ -55,16 +55,16 @@ def extract_mesh(
     query.sdf_grid(
         encoding.settings.rank,
         keys,
-        grid.slot,
-        grid.latents,
+        grid.index,
+        grid["latents"],
         *grid_basis(encoding, resolution),
         sdf,
     )
     vertices, faces = _march(keys, upper, support, sdf, resolution, voxel_size)
-    if grid.with_evidence and len(faces):
+    if "evidence" in grid and len(faces):
         evidence = np.empty(len(vertices), np.float32)
         interpolate_evidence(
-            vertices, 1.0 / voxel_size, grid.slot, grid.masks, grid.evidence, evidence
+            vertices, 1.0 / voxel_size, grid.index, grid["masks"], grid["evidence"], evidence
         )
         vertices, faces = cut_mesh(vertices, faces, evidence - np.float32(min_evidence))
     sums = np.zeros((len(vertices), 3), np.int32)
@@ -111,7 +111,8 @@ def cut_mesh(
     )
     # what a cut through a corner makes of a triangle
     rest = rest[(rest != np.roll(rest, 1, axis=1)).all(axis=1)]
-    return _without_unused(np.concatenate([vertices, on_edges]), rest)
+    together = np.concatenate([vertices, on_edges]).astype(np.float32, copy=False)
+    return _without_unused(together, rest)
 
 
 def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -164,7 +165,7 @@ def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int32], ND
     keys = unique_rows((grid.voxel_keys()[:, None] + STEPS).reshape(-1, 3))
     support = np.empty((len(keys), 2), np.uint32)
     if len(keys):
-        query.corner_support(keys, grid.slot, grid.masks, support_closing, support)
+        query.corner_support(keys, grid.index, grid["masks"], support_closing, support)
     with_surface = support.any(axis=1)
     keys, support = keys[with_surface], support[with_surface]
     # the last cells of a cube need the samples above
@@ -230,7 +231,7 @@ def _march(
     cases, edges = np.empty(sdf.shape, np.uint8), np.zeros(sdf.shape, np.int32)
     triangles, on_edges = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
     kernels.classify_cells(
-        resolution, upper, support, sdf, counts, edge_table, flags, cases, edges, triangles
+        resolution, upper, support, sdf, counts, edge_table, flags, edges, cases, triangles
     )
     kernels.count_vertices(edges, on_edges)
     vertex_starts, triangle_starts = _starts(on_edges), _starts(triangles)

@@ -8,11 +8,12 @@ import numpy as np
 
 from .. import runtime
 from ..errors import InputError
+from ..kernels.layout import Layout
 from ..types import PointCloud
-from .base_map import Integration
-from .frame_blocks import FrameBlocks
-from .property_map import PropertyMap
-from .regressor import Regressor
+from .base_map import BaseMap, Integration
+from .binner import Binner
+from .encoder import Encoder
+from .property_map import PropertyMap, encode_values
 
 
 class PropertyGroup:
@@ -33,14 +34,14 @@ class PropertyGroup:
         for other in self.maps[1:]:
             if other.settings != first.settings:
                 raise InputError(
-                    f"property group: '{first.name}' and '{other.name}' have other settings: {first.settings} and "
-                    f"{other.settings}"
+                    f"property group: '{first.name}' and '{other.name}' have other settings: "
+                    f"{first.settings} and {other.settings}"
                 )
-        self._encoders: dict[int, tuple[FrameBlocks, Regressor]] = {}  # by channels in all
+        self._encoders: dict[Layout, Encoder] = {}
 
-    def name_in(self, cloud: PointCloud) -> str:
+    def names_in(self, cloud: PointCloud) -> list[str]:
         """The names of the maps whose attribute a cloud has."""
-        return " + ".join(each.name for each in self.maps if each.name in cloud.attributes)
+        return [each.name for each in self.maps if each.wants(cloud)]
 
     def integrate(self, cloud: PointCloud) -> dict[str, Integration]:
         """Fuse a cloud in world coordinates into the maps whose attribute it has; by name what that
@@ -49,44 +50,70 @@ class PropertyGroup:
         Each map is as after an `integrate` of its own; raises as that does, with all maps
         unchanged.
         """
-        present = [each for each in self.maps if each.name in cloud.attributes]
+        present = [each for each in self.maps if each.wants(cloud)]
         finite = [
-            each
-            for each in present
-            if len(present) > 1 and np.isfinite(each._observed(cloud).sum())
+            each for each in present if len(present) > 1 and np.isfinite(each.observed(cloud).sum())
         ]
         # nothing to share; a map whose values are not all finite leaves points out
         if len(finite) < 2 or not len(cloud):
             return {each.name: each.integrate(cloud) for each in present}
-        runtime.check_alive(finite[0]._grid.runtime)
-        blocks, regressor = self._encoder(finite)
-        finite[0]._encode_values(
-            blocks, regressor, cloud.points, [cloud.attributes[each.name] for each in finite]
-        )
-        for each in finite:
-            # what does not fit is said before the first of them changes
-            each._grid.reserve(blocks.count)
-        done, first = {}, 0
-        for each in finite:
-            done[each.name] = Integration(
-                len(cloud), each._regressor.fuse(blocks, regressor, first), len(each)
-            )
-            first += each.channels
+        done = self._integrate_together(finite, cloud)
         return done | {each.name: each.integrate(cloud) for each in present if each not in finite}
 
-    def _encoder(self, maps: Sequence[PropertyMap]) -> tuple[FrameBlocks, Regressor]:
-        """Scratch for the properties of a frame; the first map's index says which voxel is which
-        block.
-        """
-        channels = sum(each.channels for each in maps)
-        if channels not in self._encoders or self._encoders[channels][0].grid is not maps[0]._grid:
-            self._encoders[channels] = maps[0]._make_encoder(channels)
-        return self._encoders[channels]
+    def _integrate_together(
+        self, maps: Sequence[PropertyMap], cloud: PointCloud
+    ) -> dict[str, Integration]:
+        """Encode the maps' values side by side, and fuse to each map its part."""
+        lead, channels = maps[0], sum(each.channels for each in maps)
+        runtime.check_alive(lead.grid.runtime)
+        # the first map's index says which voxel is which block
+        binner = Binner(lead.grid, lead.voxel_size, channels)
+        values = [cloud.attributes[each.name] for each in maps]
+        encoder = self._encoder(lead, channels)
+        local = encode_values(binner, encoder, lead.settings, cloud.points, values)
+        for each in maps:  # what does not fit is said before the first of them changes
+            each.grid.reserve(local.count)
+        done, first = {}, 0
+        for each in maps:
+            encoded = each.grid.fuse(local.part(first, each.channels))
+            done[each.name] = Integration(len(cloud), encoded, len(each))
+            first += each.channels
+        return done
+
+    def _encoder(self, lead: PropertyMap, channels: int) -> Encoder:
+        """An encoder of so many values a point, which is otherwise that of the maps."""
+        layout = Layout(
+            lead.layout.rank, channels, lead.layout.centered, information=lead.layout.information
+        )
+        if layout not in self._encoders:
+            self._encoders[layout] = Encoder(lead.grid.runtime, lead.settings, layout)
+        return self._encoders[layout]
 
 
-def group_maps(maps: Iterable[PropertyMap]) -> list[PropertyGroup]:
-    """The maps in groups of equal settings, in their order."""
-    groups: dict[object, list[PropertyMap]] = {}
+class Alone:
+    """A map that shares its encoding with no other."""
+
+    def __init__(self, only: BaseMap) -> None:
+        self.maps = (only,)
+
+    def names_in(self, cloud: PointCloud) -> list[str]:
+        """The map's name, if it wants the cloud."""
+        return [each.name for each in self.maps if each.wants(cloud)]
+
+    def integrate(self, cloud: PointCloud) -> dict[str, Integration]:
+        """Fuse a cloud in world coordinates, if the map wants it; by name what that did."""
+        return {each.name: each.integrate(cloud) for each in self.maps if each.wants(cloud)}
+
+
+def group_maps(maps: Iterable[BaseMap]) -> list[PropertyGroup | Alone]:
+    """The maps in their order, property maps of equal settings together."""
+    groups: dict[object, list[BaseMap]] = {}
     for each in maps:
-        groups.setdefault(each.settings, []).append(each)
-    return [PropertyGroup(members) for members in groups.values()]
+        key = each.settings if isinstance(each, PropertyMap) else each.name
+        groups.setdefault(key, []).append(each)
+    return [
+        PropertyGroup(together)
+        if (together := [each for each in members if isinstance(each, PropertyMap)])
+        else Alone(members[0])
+        for members in groups.values()
+    ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any, Literal, Self, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +12,17 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..errors import InputError
 from ..types import PointCloud
-from .base_map import BaseMap
-from .frame_blocks import FrameBlocks
-from .regressor import Regressor
+from .base_map import check_channels
+from .binner import Binner
+from .encoder import Encoder
+from .local_lim import LocalLim
+from .regression_map import RegressionMap
 from .settings import PropertySettings
 
 NEAREST_REACH = 2  # voxels
 
 
-class PropertyMap(BaseMap):
+class PropertyMap(RegressionMap[PropertySettings]):
     """A continuous field of `channels` values on the surface, fused from the attribute `name` of
     point clouds.
 
@@ -34,21 +37,25 @@ class PropertyMap(BaseMap):
     settings_type = PropertySettings
 
     def __init__(
-        self, name: str, channels: int, settings: PropertySettings | None = None, **overrides
+        self,
+        name: str,
+        channels: int,
+        settings: PropertySettings | None = None,
+        **overrides: Any,
     ) -> None:
         settings = dataclasses.replace(settings or PropertySettings(), **overrides)
-        if channels < 1:
-            raise InputError(f"property map '{name}': channels must be at least 1, got {channels}")
-        super().__init__(
-            name, channels, settings, centered=settings.prior == "mean", derivatives=False
-        )
-        self._cells = FrameBlocks(self._grid, channels, with_positions=False)
+        check_channels(f"property map '{name}'", channels)
+        super().__init__(name, channels, settings, centered=settings.prior == "mean")
+        self.binner = Binner(self.grid, settings.voxel_size, channels)
 
     @classmethod
-    def _restore(cls, name: str, channels: int, settings: PropertySettings) -> PropertyMap:
+    def _empty(cls, name: str, channels: int, settings: PropertySettings) -> Self:
         return cls(name, channels, settings)
 
-    def _observed(self, cloud: PointCloud) -> NDArray[np.float32]:
+    def wants(self, cloud: PointCloud) -> bool:
+        return self.name in cloud.attributes
+
+    def observed(self, cloud: PointCloud) -> NDArray[np.float32]:
         values = cloud.attributes.get(self.name)
         if values is None:
             raise InputError(
@@ -57,56 +64,49 @@ class PropertyMap(BaseMap):
             )
         if values.shape[1] != self.channels:
             raise InputError(
-                f"property map '{self.name}': expected {self.channels} channels, the cloud has {values.shape[1]}"
+                f"property map '{self.name}': expected {self.channels} channels, the cloud has "
+                f"{values.shape[1]}"
             )
         return values
 
-    def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
-        self._encode_values(
-            self._cells, self._regressor, cloud.points, [cloud.attributes[self.name]]
-        )
-        return self._cells
+    def encode(self, cloud: PointCloud) -> LocalLim:
+        values = [cloud.attributes[self.name]]
+        return encode_values(self.binner, self.encoder, self.settings, cloud.points, values)
 
-    _encode_points = _encode_cells
+    @overload
+    def query(
+        self, points: NDArray, return_valid: Literal[False] = False
+    ) -> NDArray[np.float32]: ...
 
-    def _encode_values(
-        self,
-        blocks: FrameBlocks,
-        regressor: Regressor,
-        points: NDArray[np.float32],
-        values: Sequence[NDArray[np.float32]],
-    ) -> None:
-        """Encode arrays of values (N, c), side by side, at points (N, 3) world [m], from cell
-        averages or each as it is.
-        """
-        if self.settings.sampling == "points":
-            self._encode_samples(blocks, regressor, points, np.hstack(values))
-            blocks.bin_support(points, self.voxel_size, 1)
-            return
-        blocks.touch(points, self.voxel_size)
-        blocks.bin(points, values, self.voxel_size)
-        blocks.compact(1)
-        regressor.encode_cells(blocks)
+    @overload
+    def query(
+        self, points: NDArray, return_valid: Literal[True]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]: ...
 
-    def _make_encoder(self, channels: int) -> tuple[FrameBlocks, Regressor]:
-        """Scratch to encode `channels` values a point as this map encodes its own."""
-        centered = self.settings.prior == "mean"
-        return (
-            FrameBlocks(self._grid, channels, with_positions=False),
-            Regressor(
-                self._grid, self.settings, channels=channels, centered=centered, derivatives=False
-            ),
-        )
-
-    def query(self, points: NDArray, return_valid: bool = False):
+    def query(
+        self, points: NDArray, return_valid: bool = False
+    ) -> NDArray[np.float32] | tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Property values (N, c) float32 at points (N, 3) world [m]; optionally also where (N,) a
         voxel covers the point.
 
         Elsewhere the value is that of the nearest voxel within two, so that a mesh has no black
         rims, and 0 beyond.
         """
-        runtime.check_alive(self._grid.runtime)
-        values, valid = self._regressor.query(
-            points, blend=self.settings.blend, reach=NEAREST_REACH
-        )
+        runtime.check_alive(self.grid.runtime)
+        values, valid = self.decoder.decode(self.grid, points, self.settings.blend, NEAREST_REACH)
         return (values, valid) if return_valid else values
+
+
+def encode_values(
+    binner: Binner,
+    encoder: Encoder,
+    settings: PropertySettings,
+    points: NDArray[np.float32],
+    values: Sequence[NDArray[np.float32]],
+) -> LocalLim:
+    """Encode arrays of values (N, c), side by side, at points (N, 3) world [m], from cell averages
+    or each as it is.
+    """
+    if settings.sampling == "points":
+        return encoder.encode_samples(binner.sort(points, np.hstack(values)))
+    return encoder.encode(binner.bin(points, values))

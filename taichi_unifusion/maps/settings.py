@@ -10,7 +10,8 @@ from typing import Literal
 from ..errors import InputError, check_choice
 from .encoding import EncoderSettings
 
-MAX_LATENT_RANK = 20  # of a map of features: its kernels unroll over it
+MAX_RESOLUTION = 32  # mesh cells along a voxel's edge
+MAX_FEATURE_RANK = 20  # of a map of features: its kernels unroll over it
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class PropertySettings(MapSettings):
 
 
 @dataclass(frozen=True)
-class LatentSettings(MapSettings):
+class FeatureSettings(MapSettings):
     """Settings of a map of high-dimensional features (Sec. IV-D)."""
 
     voxel_size: float = 0.1
@@ -159,7 +160,7 @@ class LatentSettings(MapSettings):
                 f"'{self.sampling}' and '{self.fusion}'"
             )
         check_choice("precision", self.precision, ("int8", "float16", "float32"))
-        if not 2 <= self.encoder.rank <= MAX_LATENT_RANK:
+        if not 2 <= self.encoder.rank <= MAX_FEATURE_RANK:
             raise InputError(
-                f"encoder: rank must lie in 2..{MAX_LATENT_RANK} in a map of features, got {self.encoder.rank}"
+                f"encoder: rank must lie in 2..{MAX_FEATURE_RANK} in a map of features, got {self.encoder.rank}"
             )

@@ -5,6 +5,8 @@ surfaces (Sec. IV-B).
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +14,19 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..errors import InputError
 from ..kernels import visibility
+from ..kernels.cells import CELLS
+from ..runtime import DeviceArray
 from ..types import Mesh, PointCloud
-from .base_map import BaseMap
-from .frame_blocks import FrameBlocks
+from .binner import SurfelBinner
+from .encoder import to_device
+from .local_lim import LocalLim
 from .meshing import drop_small_parts, extract_mesh
-from .settings import SurfaceSettings
+from .regression_map import RegressionMap
+from .settings import MAX_RESOLUTION, SurfaceSettings
+from .voxel_grid import EVIDENCE, VoxelData
 
 
-class SurfaceMap(BaseMap):
+class SurfaceMap(RegressionMap[SurfaceSettings]):
     """A continuous signed distance field, fused from point clouds with normals.
 
         surface = SurfaceMap(voxel_size=0.05)
@@ -33,117 +40,127 @@ class SurfaceMap(BaseMap):
     kind = "surface"
     settings_type = SurfaceSettings
 
-    def __init__(self, settings: SurfaceSettings | None = None, **overrides) -> None:
+    def __init__(self, settings: SurfaceSettings | None = None, **overrides: Any) -> None:
         settings = dataclasses.replace(settings or SurfaceSettings(), **overrides)
         derivatives = settings.gpis == "derivatives"
         super().__init__(
-            "surface", 1, settings, centered=False, derivatives=derivatives, evidence=settings.carve
+            "surface",
+            1,
+            settings,
+            centered=False,
+            derivatives=derivatives,
+            fields=[EVIDENCE] * settings.carve,
         )
-        steps = (
-            (0.0,) if derivatives else (-settings.sample_distance, 0.0, settings.sample_distance)
+        beside = settings.sample_distance
+        steps = (0.0,) if derivatives else (-beside, 0.0, beside)
+        self.binner = SurfelBinner(
+            self.grid,
+            settings.voxel_size,
+            np.array(steps, np.float32),
+            support_points=settings.support_points,
+            with_normals=derivatives,
         )
-        self._steps = np.array(steps, np.float32)  # of the samples along the normal [voxels]
-        self._surfels = FrameBlocks(self._grid, 3, with_positions=True)
-        self._samples = FrameBlocks(self._grid, 4 if derivatives else 1, with_positions=False)
 
     @classmethod
-    def _restore(cls, name: str, channels: int, settings: SurfaceSettings) -> SurfaceMap:
+    def _empty(cls, name: str, channels: int, settings: SurfaceSettings) -> Self:
         return cls(settings)
 
-    def _observed(self, cloud: PointCloud) -> NDArray[np.float32]:
+    def wants(self, cloud: PointCloud) -> bool:
+        return True
+
+    def observed(self, cloud: PointCloud) -> NDArray[np.float32]:
         if cloud.normals is None:
             raise InputError(
                 "surface map: the cloud has no normals; `preprocess` computes them, or give your own"
             )
         return cloud.normals
 
-    def _encode_cells(self, cloud: PointCloud) -> FrameBlocks:
-        """Average points and normals in cells; each average is a surfel that gives samples at the
-        cells along its normal.
+    def encode(self, cloud: PointCloud) -> LocalLim:
+        normals = self.observed(cloud)
+        if self.settings.sampling == "cells":
+            return self.encoder.encode(self.binner.bin(cloud.points, [normals]))
+        return self.encoder.encode_samples(self.binner.sort(*self._samples(cloud.points, normals)))
 
-        A sample is moved to its cell's centre, and its target is the centre's distance to the
-        surfel's plane: exact to first order, and its features come from a table.
+    def _samples(
+        self, points: NDArray[np.float32], normals: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Samples at every point and beside it, as published, and their targets: x + a n -> a,
+        x - a n -> -a, in voxels; with derivatives also the normals.
         """
-        while True:
-            self._surfels.touch(cloud.points, self.voxel_size)
-            self._surfels.bin(cloud.points, [cloud.normals], self.voxel_size)
-            if self._surfels.touch_samples(self._steps):
-                break
-        self._samples.bin_samples(self._surfels, self._steps)
-        self._samples.compact(self.settings.support_points)
-        self._regressor.encode_cells(self._samples)
-        return self._samples
+        count = len(self.binner.steps)
+        steps = np.repeat(self.binner.steps, len(points))[:, None]
+        repeated = np.tile(normals, (count, 1))
+        samples = np.tile(points, (count, 1)) + steps * np.float32(self.voxel_size) * repeated
+        targets = np.hstack([steps, repeated]) if self.layout.derivatives else steps
+        return samples.astype(np.float32, copy=False), targets
 
-    def _encode_points(self, cloud: PointCloud) -> FrameBlocks:
-        """Samples at every point and beside it, as published: x + a n -> a, x - a n -> -a, in
-        voxels.
+    def learn_visibility(self, cloud: PointCloud, local: LocalLim, sign: int) -> None:
+        """Per cell: +1 if the depth image saw its surface, -1 if it saw through it. Without a depth
+        image: +1 for supported cells.
         """
-        steps = np.repeat(self._steps, len(cloud))[:, None]
-        samples = np.tile(cloud.points, (len(self._steps), 1)) + steps * np.float32(
-            self.voxel_size
-        ) * np.tile(cloud.normals, (len(self._steps), 1))
-        targets = (
-            np.hstack([steps, np.tile(cloud.normals, (len(self._steps), 1))])
-            if self._regressor.derivatives
-            else steps
-        )
-        self._encode_samples(self._samples, self._regressor, samples, targets)
-        self._samples.bin_support(samples, self.voxel_size, self.settings.support_points)
-        return self._samples
-
-    def _vote(self, cloud: PointCloud, blocks: FrameBlocks, sign: int) -> None:
-        """Let the frame's rays vote on what they saw and what they passed through; without rays,
-        its points on what they are.
-        """
-        grid, view = self._grid, cloud.view
-        if self.settings.carve and view is None:
+        grid, view = self.grid, cloud.view
+        if not self.settings.carve:
+            return
+        if view is None:
             visibility.vote_support(
-                blocks.count, blocks.keys, blocks.support, grid.slot, sign, grid.evidence
+                local.count, local.keys, local.support, grid.index, sign, grid["evidence"]
             )
-        elif self.settings.carve:
-            camera = view.camera
-            visibility.vote_cells(
-                self.settings.encoder.rank,
-                grid.count,
-                grid.keys,
-                grid.masks,
-                grid.latents,
-                self._regressor.cell_gradients,
-                self.voxel_size,
-                view.values,
-                camera.fx,
-                camera.fy,
-                camera.cx,
-                camera.cy,
-                np.ascontiguousarray(view.T_camera_cloud[:3], np.float32),
-                sign,
-                grid.evidence,
-            )
+            return
+        visibility.vote_cells(
+            self.layout.rank,
+            grid.count,
+            grid["keys"],
+            grid["masks"],
+            grid["latents"],
+            self.cell_gradients,
+            self.voxel_size,
+            view.values,
+            view.camera.intrinsics,
+            view.T_camera_cloud[:3],
+            sign,
+            grid["evidence"],
+        )
+
+    @cached_property
+    def cell_gradients(self) -> DeviceArray:
+        """(4^3, 4, l): f_posi and its gradient by voxel units at the centres of a voxel's own
+        cells.
+        """
+        encoding = self.encoder.tables.encoding
+        t = encoding.nodes(CELLS) / 2  # a voxel is the inner half of its doubled voxel
+        return to_device(np.concatenate([encoding(t)[:, None], 0.5 * encoding.gradient(t)], axis=1))
+
+    def _fuse_voxels(self, data: VoxelData) -> None:
+        super()._fuse_voxels(data)
+        if data.evidence is not None and len(data):
+            slots = np.empty(len(data), np.int32)
+            self.grid.find(len(data), data.keys, data.weights, slots)
+            visibility.add_evidence(slots, data.evidence, self.grid["evidence"])
 
     def sdf(self, points: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Signed distance (N,) [m] at points (N, 3) world [m], positive in front of the surface,
         and where it is known (N,).
         """
-        runtime.check_alive(self._grid.runtime)
-        values, valid = self._regressor.query(points, blend=True, reach=0)
+        runtime.check_alive(self.grid.runtime)
+        values, valid = self.decoder.decode(self.grid, points, blend=True, reach=0)
         return values[:, 0] * np.float32(self.voxel_size), valid
 
     def extract_mesh(self, resolution: int = 4, min_area: float = 0.0) -> Mesh:
         """The zero level by marching cubes on `resolution`^3 cells a voxel; an empty mesh where
         nothing was integrated.
 
-        Connected parts of less than `min_area` square metres are left out.
-
-        Raises InputError for a resolution outside 1..32.
+        Connected parts of less than `min_area` square metres are left out. Raises InputError for a
+        resolution outside 1..32.
         """
-        runtime.check_alive(self._grid.runtime)
-        if not 1 <= resolution <= 32:
+        runtime.check_alive(self.grid.runtime)
+        if not 1 <= resolution <= MAX_RESOLUTION:
             raise InputError(
-                f"extract_mesh: resolution must lie in 1..32 cells a voxel, got {resolution}"
+                f"extract_mesh: resolution must lie in 1..{MAX_RESOLUTION} cells a voxel, got "
+                f"{resolution}"
             )
         mesh = extract_mesh(
-            self._grid,
-            self._regressor.encoding,
+            self.grid,
+            self.encoder.tables.encoding,
             self.voxel_size,
             resolution,
             self.settings.support_closing,

@@ -2,13 +2,13 @@
 (Sec. IV-A).
 
 The tree spans 16,384 voxels an axis around the origin (819 m at 5 cm) and holds, per voxel, its
-slot and which block of which frame it is. Latents, weights and support masks lie in dense pools
-that double when they are full.
+slot and which block of which frame it is. What a voxel holds lies in pools, one a field.
 """
 
 from __future__ import annotations
 
 import weakref
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,83 +16,115 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..errors import CapacityError
-from ..kernels import voxels as kernels
+from ..errors import CapacityError, MapCorrupt
+from ..kernels import index as kernels
+from ..kernels.cells import BLOCK_CELLS
+from ..kernels.pools import gather_rows
+from ..runtime import DeviceArray, grown
+from .pool import Pool, VoxelField
 
 # bytes of sparse nodes: Taichi's CPU pool fails silently somewhat above 1.6 GB
 SPARSE_LIMIT = 1 << 30
 # a 4^3 leaf with three i32 fields and its share of the nodes above it
 BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16
-# touched voxels between two counts of the leaves, at least: 0.2 GB of sparse nodes at worst
+# recount the tree's leaves after at least this many touches (0.2 GB can grow unnoticed)
 CHECK_EVERY = 100_000
 FIRST_CAPACITY = 4096
 
+KEYS = VoxelField("keys", np.dtype(np.int32), (3,))
+WEIGHTS = VoxelField("weights", np.dtype(np.float32))
+MASKS = VoxelField("masks", np.dtype(np.uint32), (2,))  # support of the voxel's cells
+# frames that saw surface in a cell minus frames that saw through it
+EVIDENCE = VoxelField("evidence", np.dtype(np.int8), (BLOCK_CELLS,))
 
-def _build_tree() -> tuple:
-    """Fields slot, stamp and block of a new index tree, and the node above its leaves."""
-    fields = tuple(ti.field(ti.i32) for _ in range(3))
-    builder = ti.FieldsBuilder()
-    node = builder.pointer(ti.ijk, 64)
-    for _ in range(3):
-        node = node.pointer(ti.ijk, 4)
-    node.bitmasked(ti.ijk, 4).place(*fields)
-    builder.finalize()
-    return *fields, node
+
+def latents(rows: int, channels: int) -> VoxelField:
+    """The field of latents (r, c): F, and a prior mean."""
+    return VoxelField("latents", np.dtype(np.float32), (rows, channels))
 
 
 @dataclass(frozen=True)
 class VoxelData:
-    """Voxels by value, sorted by index: what maps save, load and merge."""
+    """Voxels by value, sorted by index (i, then j, then k): what maps save, load and merge."""
 
     keys: NDArray[np.int32]  # (N, 3) voxel index
-    latents: NDArray[np.float32]  # (N, r, c)
-    weights: NDArray[np.float32]  # (N,)
-    masks: NDArray[np.uint32]  # (N, 2) support
-    evidence: NDArray[np.int8] | None = None  # (N, 64) frames for a cell minus frames against it
-    sums: NDArray[np.float32] | None = None  # (N, q) of the regression, with `fusion: information`
+    fields: Mapping[str, NDArray]  # (N, ...) each, by name
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @property
+    def latents(self) -> NDArray[np.float32]:
+        """(N, r, c)."""
+        return self.fields["latents"]
+
+    @property
+    def weights(self) -> NDArray[np.float32]:
+        """(N,)."""
+        return self.fields["weights"]
+
+    @property
+    def masks(self) -> NDArray[np.uint32]:
+        """(N, 2) support."""
+        return self.fields["masks"]
+
+    @property
+    def evidence(self) -> NDArray[np.int8] | None:
+        """(N, 64) frames for a cell minus frames against it; None where the map counts none."""
+        return self.fields.get("evidence")
+
+    @property
+    def sums(self) -> NDArray[np.float32] | None:
+        """(N, q) of the regression, with `fusion: information`."""
+        return self.fields.get("sums")
+
+    @property
+    def tensors(self) -> dict[str, NDArray]:
+        """Keys and fields, as the arrays of a map file."""
+        return {"keys": self.keys, **self.fields}
 
 
 class VoxelGrid:
-    """Voxels of one map: index tree and pools; `evidence` and `sums` are pools that only some maps
-    have.
-    """
+    """Voxels of one map: an index tree, and a pool for each of `fields` beside their keys."""
 
-    def __init__(self, rows: int, channels: int, *, evidence: bool = False, sums: int = 0) -> None:
+    def __init__(self, fields: Sequence[VoxelField]) -> None:
         self.runtime = runtime.current()
-        self.rows, self.channels = rows, channels
-        self.with_evidence, self.sum_count = evidence, sums
+        self.fields = tuple(fields)
         self.count = 0  # slots given out
         self.empty = 0  # of them, those whose voxel was removed
         self.frame = 0
-        self._tree = self._borrow_tree()
-        self.slot, self.stamp, self.block, self.leaf_parent = self._tree
-        self._allocate(FIRST_CAPACITY)
+        self.index = self._borrow_tree()
+        self._pools = {field.name: Pool(field, FIRST_CAPACITY) for field in (KEYS, *self.fields)}
         self._leaves, self._touched = 0, 0
 
-    def _borrow_tree(self) -> tuple:
+    def __getitem__(self, name: str) -> DeviceArray:
+        """The array of a pool, (S, ...) by slot; another one after the grid has grown."""
+        return self._pools[name].array
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._pools
+
+    def __len__(self) -> int:
+        return self.count - self.empty
+
+    @property
+    def capacity(self) -> int:
+        """Voxels that there is room for."""
+        return self._pools["keys"].capacity
+
+    def _borrow_tree(self) -> kernels.Index:
         """An empty index tree: one that a map no longer uses, else a new one. Taichi never frees
         the memory of a tree.
         """
         free = self.runtime.free_trees
         if free:
             tree = free.pop()
-            tree[-1].parent(2).deactivate_all()  # the topmost pointer node
+            tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
         else:
             self.runtime.count_tree()
             tree = _build_tree()
         weakref.finalize(self, free.append, tree)
         return tree
-
-    def _allocate(self, capacity: int) -> None:
-        self.capacity = capacity
-        self.keys = ti.ndarray(ti.i32, (capacity, 3))
-        self.latents = ti.ndarray(ti.f32, (capacity, self.rows, self.channels))
-        self.weights = ti.ndarray(ti.f32, (capacity,))
-        self.masks = ti.ndarray(ti.u32, (capacity, 2))
-        self.evidence = ti.ndarray(
-            ti.i8, (capacity if self.with_evidence else 1, kernels.BLOCK_CELLS)
-        )
-        self.sums = ti.ndarray(ti.f32, (capacity, self.sum_count) if self.sum_count else (1, 1))
 
     def next_frame(self) -> int:
         """A new frame stamp, which makes every block number of earlier frames void."""
@@ -108,110 +140,131 @@ class VoxelGrid:
         """
         self._touched += voxels
         if self._touched > max(CHECK_EVERY, self._leaves):
-            self._leaves, self._touched = int(kernels.count_leaves(self.leaf_parent)), 0
+            self._leaves, self._touched = int(kernels.count_leaves(self.index)), 0
         if self._leaves * BYTES_PER_LEAF > SPARSE_LIMIT:
             raise CapacityError(
-                f"the map holds {self.count:,} voxels and its index would pass 1 GB, where Taichi is no longer "
-                "safe: use larger voxels or save the map and start a new one"
+                f"the map holds {self.count:,} voxels and its index would pass 1 GB, where Taichi "
+                "is no longer safe: use larger voxels or save the map and start a new one"
             )
 
     def reserve(self, extra: int) -> None:
         """Make room for `extra` more voxels; raises CapacityError before sparse memory becomes
-        unsafe.
+        unsafe, or a pool larger than an array can be.
         """
         self.note_touched(extra)
-        if self.count + extra <= self.capacity:
+        needed = self.count + extra
+        if needed <= self.capacity:
             return
-        old, evidence, sums = (
-            (self.keys, self.latents, self.weights, self.masks),
-            self.evidence,
-            self.sums,
-        )
-        self._allocate(max(2 * self.capacity, self.count + extra))
-        if self.count:
-            kernels.copy_voxels(self.count, *old, self.keys, self.latents, self.weights, self.masks)
-            if self.with_evidence:
-                kernels.copy_rows(self.count, evidence, self.evidence)
-            if self.sum_count:
-                kernels.copy_rows(self.count, sums, self.sums)
+        rows = grown(self.capacity, needed)
+        for pool in self._pools.values():  # what does not fit is said before the first one changes
+            pool.check_room(rows, len(self))
+        for pool in self._pools.values():
+            pool.reserve(rows, self.count)
 
-    def claim(self, blocks: int, keys, weights, slots) -> int:
+    def claim(
+        self, blocks: int, keys: DeviceArray, weights: DeviceArray, slots: DeviceArray
+    ) -> int:
         """Fill `slots` (B,) with the slot of every block of positive weight, new or known, and -1
         elsewhere; counts those.
         """
         self.reserve(blocks)
         counters = np.array([self.count, 0], np.int32)
-        kernels.claim_slots(blocks, keys, weights, self.slot, slots, self.keys, counters)
+        kernels.claim_slots(blocks, keys, weights, self.index, counters, slots, self["keys"])
         runtime.synchronize()
         self.count = int(counters[0])
         return int(counters[1])
 
-    def find(self, blocks: int, keys, weights, slots) -> int:
+    def find(self, blocks: int, keys: DeviceArray, weights: DeviceArray, slots: DeviceArray) -> int:
         """Fill `slots` (B,) with the slot of every block of positive weight, -1 where the map has
         none; counts them.
         """
         found = np.zeros(1, np.int32)
-        kernels.find_slots(blocks, keys, weights, self.slot, slots, found)
+        kernels.find_slots(blocks, keys, weights, self.index, found, slots)
         runtime.synchronize()
         return int(found[0])
 
-    def release(self, blocks: int, keys, slots) -> None:
+    def release(self, blocks: int, keys: DeviceArray, slots: DeviceArray) -> None:
         """Give up the voxels of `slots` that have no weight left."""
         released = np.zeros(1, np.int32)
-        kernels.release_slots(blocks, keys, slots, self.weights, self.slot, released)
+        kernels.release_slots(blocks, keys, slots, self["weights"], self.index, released)
         runtime.synchronize()
         self.empty += int(released[0])
-
-    def __len__(self) -> int:
-        return self.count - self.empty
 
     def _used(self) -> NDArray[np.int32]:
         """Slots that hold a voxel."""
         if not self.empty:
             return np.arange(self.count, dtype=np.int32)
-        return np.flatnonzero(self.weights.to_numpy()[: self.count] > 0).astype(np.int32)
+        return np.flatnonzero(self["weights"].to_numpy()[: self.count] > 0).astype(np.int32)
 
     def voxel_keys(self) -> NDArray[np.int32]:
         """(N, 3) voxel indices, in no order."""
-        return self.keys.to_numpy()[self._used()]
+        return self["keys"].to_numpy()[self._used()]
 
     def export(self) -> VoxelData:
-        """All voxels by value, sorted by index (i, then j, then k)."""
+        """All voxels by value."""
         runtime.check_alive(self.runtime)
-        n = len(self)
         keys, used = self.voxel_keys(), self._used()
         order = np.lexsort(keys.T[::-1])
         slots = np.ascontiguousarray(used[order])
+        fields = {field.name: self._pools[field.name].take(slots) for field in self.fields}
+        return VoxelData(np.ascontiguousarray(keys[order]), fields)
+
+    def put(self, data: VoxelData) -> None:
+        """Fill this empty grid with voxels, exactly as they are."""
+        assert self.count == 0
+        if len(data):
+            slots = np.empty(len(data), np.int32)
+            self.claim(len(data), data.keys, data.weights, slots)
+            order = np.argsort(slots, kind="stable").astype(np.int32)
+            for field in self.fields:
+                gather_rows(order, data.fields[field.name], self[field.name])
+
+    def check(self, path: object, tensors: Mapping[str, NDArray]) -> VoxelData:
+        """The voxels that a file's tensors hold; raises MapCorrupt where they are not those of such
+        a grid.
+        """
+        n = len(tensors["keys"]) if "keys" in tensors else -1
+        for field in (KEYS, *self.fields):
+            shape, array = (n, *field.shape), tensors.get(field.name)
+            if array is None or array.shape != shape or array.dtype != field.dtype:
+                found = "nothing" if array is None else f"{array.shape} {array.dtype}"
+                raise MapCorrupt(
+                    f"{path}: tensor '{field.name}' should be {shape} {field.dtype}, found "
+                    f"{found}; integrate the frames again"
+                )
         data = VoxelData(
-            np.ascontiguousarray(keys[order]),
-            np.empty((n, self.rows, self.channels), np.float32),
-            np.empty(n, np.float32),
-            np.empty((n, 2), np.uint32),
-            np.empty((n, kernels.BLOCK_CELLS), np.int8) if self.with_evidence else None,
-            np.empty((n, self.sum_count), np.float32) if self.sum_count else None,
+            tensors["keys"], {field.name: tensors[field.name] for field in self.fields}
         )
-        if n:
-            kernels.gather_voxels(
-                slots,
-                self.latents,
-                self.weights,
-                self.masks,
-                data.latents,
-                data.weights,
-                data.masks,
-            )
-            if data.evidence is not None:
-                kernels.gather_rows(slots, self.evidence, data.evidence)
-            if data.sums is not None:
-                kernels.gather_rows(slots, self.sums, data.sums)
+        half = kernels.INDEX_HALF
+        if n and not (data.keys.min() >= -half and data.keys.max() < half):
+            raise MapCorrupt(f"{path}: holds voxels out of range; integrate the frames again")
+        for name, values in data.fields.items():
+            if values.dtype.kind == "f" and not np.isfinite(values).all():
+                raise MapCorrupt(
+                    f"{path}: tensor '{name}' holds numbers that are not finite; "
+                    "integrate the frames again"
+                )
+        if not (data.weights > 0).all():
+            raise MapCorrupt(f"{path}: holds voxels of no weight; integrate the frames again")
+        if len(np.unique(data.keys, axis=0)) != n:
+            raise MapCorrupt(f"{path}: holds a voxel twice; integrate the frames again")
         return data
 
     @property
     def memory_bytes(self) -> int:
         """Bytes that the voxels need: pools as far as they are used, and the index tree."""
-        leaves = int(kernels.count_leaves(self.leaf_parent)) if self.count else 0
-        extra = kernels.BLOCK_CELLS * self.with_evidence + 4 * self.sum_count
-        return (
-            self.count * (12 + 4 + 8 + 4 * self.rows * self.channels + extra)
-            + leaves * BYTES_PER_LEAF
-        )
+        leaves = int(kernels.count_leaves(self.index)) if self.count else 0
+        row = sum(field.bytes for field in (KEYS, *self.fields))
+        return self.count * row + leaves * BYTES_PER_LEAF
+
+
+def _build_tree() -> kernels.Index:
+    """A new index tree."""
+    slot, stamp, block = (ti.field(ti.i32) for _ in range(3))
+    builder = ti.FieldsBuilder()
+    node = builder.pointer(ti.ijk, 64)
+    for _ in range(3):
+        node = node.pointer(ti.ijk, 4)
+    node.bitmasked(ti.ijk, 4).place(slot, stamp, block)
+    builder.finalize()
+    return kernels.Index(slot, stamp, block, node)

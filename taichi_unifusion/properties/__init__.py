@@ -13,25 +13,8 @@ import lazy_loader
 if TYPE_CHECKING:
     from ..rendering.look import Look
     from .base import SurfaceProperty
+    from .registry import PROPERTIES
     from .specification import make_property
-
-# name -> method -> module here, what makes it; the first is the default
-PROPERTIES: dict[str, dict[str, tuple[str, str]]] = {
-    "infrared": {"log": ("infrared", "log_infrared"), "linear": ("infrared", "linear_infrared")},
-    "saliency": {
-        "signature": ("saliency", "signature_saliency"),
-        "onnx": ("saliency", "network_saliency"),
-    },
-    "style": {
-        "painting": ("style", "painting_style"),
-        "opencv": ("style", "opencv_style"),
-        "sketch": ("style", "sketch_style"),
-        "onnx": ("style", "network_style"),
-    },
-    "images": {"folder": ("images", "folder_images")},
-    "normal": {"depth": ("shape", "surface_normal")},
-    "curvature": {"depth": ("shape", "mean_curvature")},
-}
 
 __all__ = ["PROPERTIES", "Look", "SurfaceProperty", "make_property"]
 
@@ -39,6 +22,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "base": ["Look", "SurfaceProperty"],
+        "registry": ["PROPERTIES"],
         "specification": ["make_property"],
     },
 )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from ..errors import FrameError, InputError, UniFusionError
 from ..maps.settings import PropertySettings
 from ..rendering.look import Look
 from ..types import Frame
+
+if TYPE_CHECKING:
+    from ..maps import PropertyMap
 
 # names that files and attributes of a results folder already have
 RESERVED = ("surface", "color", "mesh", "preview", "normals", "features")
@@ -47,6 +51,20 @@ class SurfaceProperty:
                 f"property '{self.name}': channels must be at least 1, got {self.channels}"
             )
 
+    def with_settings(self, settings: PropertySettings) -> SurfaceProperty:
+        """The same, with these settings of its map where it has none of its own."""
+        return self if self.settings is not None else replace(self, settings=settings)
+
+    def make_map(self, frame: Frame | None = None) -> PropertyMap:
+        """An empty map for the property."""
+        from ..maps import PropertyMap  # Taichi starts with the first map, not with a property
+
+        return PropertyMap(self.name, self.channels, self.settings)
+
+    def add_to(self, frame: Frame) -> Frame:
+        """The frame with its image of the property; raises as `image`."""
+        return frame.with_image(self.name, self.image(frame))
+
     def image(self, frame: Frame) -> NDArray[np.float32]:
         """The property of a frame, (H, W, c); raises FrameError where the frame has none,
         InputError for a wrong function.
@@ -58,7 +76,8 @@ class SurfaceProperty:
             raise FrameError(f"{at}: {error}") from error
         except UniFusionError:
             raise
-        except Exception as error:  # a bug in somebody's function ends the run, and what was mapped until then is kept
+        # a bug in somebody's function ends the run, and what was mapped until then is kept
+        except Exception as error:
             raise InputError(
                 f"{at}: its function failed with {type(error).__name__}: {error}"
             ) from error
@@ -67,8 +86,8 @@ class SurfaceProperty:
             values = values[..., None]
         if values.shape != (height, width, self.channels) or values.dtype.kind not in "fiub":
             raise InputError(
-                f"{at}: its function must return numbers of shape ({height}, {width}, {self.channels}), got "
-                f"{values.shape} {values.dtype}"
+                f"{at}: its function must return numbers of shape "
+                f"({height}, {width}, {self.channels}), got {values.shape} {values.dtype}"
             )
         values = values.astype(np.float32, copy=False)
         if not np.isfinite(values.max(initial=-np.inf, where=np.isfinite(values))):

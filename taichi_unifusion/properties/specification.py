@@ -22,8 +22,8 @@ from typing import get_type_hints
 from ..config import Config
 from ..errors import InputError, convert, did_you_mean
 from ..maps.settings import PropertySettings
-from . import PROPERTIES
 from .base import SurfaceProperty
+from .registry import PROPERTIES
 
 OPTION = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)=(.*)", re.DOTALL)
 

@@ -9,7 +9,7 @@ from .. import runtime
 from ..errors import FileError, InputError
 from ..files.mesh_reading import read_mesh
 from ..files.trajectories import read_trajectory
-from ..maps import LatentMap
+from ..maps import FeatureMap
 from ..types import Mesh, Trajectory
 from .run_folder import RunFolder
 
@@ -19,7 +19,7 @@ class Understood:
     """What a results folder holds for questions."""
 
     mesh: Mesh
-    features: LatentMap
+    features: FeatureMap
     trajectory: Trajectory | None
 
 
@@ -43,5 +43,5 @@ def read_understood(directory: Path, device: str) -> Understood:
     runtime.init(device)
     poses = folder.trajectory
     return Understood(
-        mesh, LatentMap.load(folder.features), read_trajectory(poses) if poses.exists() else None
+        mesh, FeatureMap.load(folder.features), read_trajectory(poses) if poses.exists() else None
     )

@@ -12,7 +12,7 @@ from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 from taichi_unifusion import Pipeline, load_map
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.files.mesh_reading import read_mesh
-from taichi_unifusion.maps import LatentMap
+from taichi_unifusion.maps import FeatureMap
 from taichi_unifusion.results import write_results
 
 COLORS = np.eye(3)  # names are directions of colour here: what is red is "red"
@@ -99,7 +99,7 @@ def lean(mesh):
 
 def test_one_pass_gives_the_map_beside_surface_and_colour(made, recording):
     features = load_map(made / "maps" / "features.safetensors")
-    assert isinstance(features, LatentMap) and features.channels == 3 and len(features) > 100
+    assert isinstance(features, FeatureMap) and features.channels == 3 and len(features) > 100
     assert features.settings.source == str(recording / "clip")
     metrics = json.loads((made / "metrics.json").read_text())
     assert metrics["frames"]["used"] == 3 and metrics["maps"]["features"]["voxels"] == len(features)
@@ -233,7 +233,7 @@ def test_frames_without_features_still_give_their_surface(frames, tmp_path):
     assert [
         ("features" in step.integrations, "features" in step.lacking) for step in run.steps
     ] == [(False, True), (True, False), (False, True)]
-    assert len(pipeline.features) > 0 and not run.skipped
+    assert len(pipeline.maps["features"]) > 0 and not run.skipped
 
     class Never(ColorFeatures):
         def image_features(self, frame):

@@ -11,14 +11,14 @@ import reference
 from taichi_unifusion import runtime
 from taichi_unifusion.errors import InputError, RuntimeStateError
 from taichi_unifusion.kernels import query as kernels
-from taichi_unifusion.kernels.voxels import INDEX_HALF
+from taichi_unifusion.kernels.index import INDEX_HALF
 from taichi_unifusion.maps import PropertyMap, SurfaceMap
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.meshing import STEPS, grid_basis
 from taichi_unifusion.maps.property_map import NEAREST_REACH
 from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
-SETTINGS = dict(encoder=EncoderSettings(rank=6, anchors=64), voxel_size=0.05)
+SETTINGS = {"encoder": EncoderSettings(rank=6, anchors=64), "voxel_size": 0.05}
 ENCODER = reference.Encoder(6, 64)
 DECODED = 1e-4  # float32 features (2e-5) times some latents of size 1
 # a point on the rim of a doubled voxel keeps this weight per axis, so that its value is defined
@@ -31,12 +31,12 @@ def write(grid: VoxelGrid, keys, latents, masks) -> None:
     """
     grid.next_frame()
     for n, key in enumerate(keys):
-        grid.slot[tuple(int(k) + INDEX_HALF for k in key)] = n + 1
+        grid.index.slot[tuple(int(k) + INDEX_HALF for k in key)] = n + 1
     for pool, values in (
-        (grid.latents, latents),
-        (grid.masks, masks),
-        (grid.keys, keys),
-        (grid.weights, np.ones(len(keys))),
+        (grid["latents"], latents),
+        (grid["masks"], masks),
+        (grid["keys"], keys),
+        (grid["weights"], np.ones(len(keys))),
     ):
         whole = pool.to_numpy()
         whole[: len(keys)] = values
@@ -51,7 +51,7 @@ def fill(grid: VoxelGrid, seed: int) -> dict[tuple, reference.Voxel]:
     rng = np.random.default_rng(seed)
     # holes, both signs, and a lone voxel
     keys = np.unique(np.vstack([rng.integers(-3, 3, (60, 3)), [[8, -8, 8]]]), axis=0)
-    latents = rng.normal(size=(len(keys), grid.rows, grid.channels)).astype(np.float32)
+    latents = rng.normal(size=(len(keys), *grid["latents"].shape[1:])).astype(np.float32)
     masks = np.bitwise_and.reduce(rng.integers(0, 2**32, (3, len(keys), 2), dtype=np.uint32))
     write(grid, keys, latents, masks)
     return {
@@ -72,7 +72,7 @@ def points_about_the_voxels() -> np.ndarray:
 @pytest.fixture(scope="module")
 def surface():
     target = SurfaceMap(**SETTINGS)
-    return target, fill(target._grid, 1)
+    return target, fill(target.grid, 1)
 
 
 def in_voxels(points) -> np.ndarray:
@@ -85,7 +85,7 @@ def in_voxels(points) -> np.ndarray:
 )
 def test_query_points_equals_its_twin(channels, prior, blend):
     target = PropertyMap("x", channels, prior=prior, blend=blend, **SETTINGS)
-    voxels, points = fill(target._grid, channels), points_about_the_voxels()
+    voxels, points = fill(target.grid, channels), points_about_the_voxels()
     values, valid = target.query(points, return_valid=True)
     twin, known = reference.query_points(
         ENCODER,
@@ -120,7 +120,7 @@ def test_blending_is_continuous_across_voxels():
     exist.
     """
     target = PropertyMap("x", 1, prior="zero", **SETTINGS)
-    fill(target._grid, 5)
+    fill(target.grid, 5)
     steps = np.linspace(-0.14, 0.14, 20_001)
     line = np.column_stack([steps, 0.6 * steps, np.full_like(steps, 0.012)])
     values, valid = target.query(line, return_valid=True)
@@ -153,7 +153,7 @@ def test_a_constant_is_decoded_at_voxel_centres_of_neighbours_too():
     target = PropertyMap("x", 1, prior="mean", **SETTINGS)
     latents = np.zeros((1, 7, 1), np.float32)
     latents[0, 6] = 0.75
-    write(target._grid, np.zeros((1, 3), np.int32), latents, np.zeros((1, 2), np.uint32))
+    write(target.grid, np.zeros((1, 3), np.int32), latents, np.zeros((1, 2), np.uint32))
     rims = (
         np.array([[0.5, 0.5, -0.5], [0.5, -0.5, -0.5], [-0.5, -0.5, -0.5], [0.2, -0.5, -0.5]])
         * 0.05
@@ -169,7 +169,7 @@ def test_corner_support_equals_its_twin(surface):
     )
     for closing in (1, 9, 27):
         support = np.empty((len(corners), 2), np.uint32)
-        kernels.corner_support(corners, target._grid.slot, target._grid.masks, closing, support)
+        kernels.corner_support(corners, target.grid.index, target.grid["masks"], closing, support)
         twin = [reference.corner_support(voxels, corner, closing).reshape(-1) for corner in corners]
         np.testing.assert_array_equal(reference.unpack_masks(support), twin)
         assert 0.02 < np.mean(twin) < 0.9
@@ -182,8 +182,8 @@ def test_sdf_grid_equals_its_twin(surface, resolution):
         np.int32
     )
     sdf = np.empty((len(corners), resolution**3), np.float32)
-    basis = grid_basis(target._regressor.encoding, resolution)
-    kernels.sdf_grid(6, corners, target._grid.slot, target._grid.latents, *basis, sdf)
+    basis = grid_basis(target.encoder.tables.encoding, resolution)
+    kernels.sdf_grid(6, corners, target.grid.index, target.grid["latents"], *basis, sdf)
     unknown = 0
     for corner, samples in zip(corners, sdf, strict=True):
         twin = reference.sdf_grid(ENCODER, voxels, corner, resolution).reshape(-1)

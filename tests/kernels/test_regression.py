@@ -9,6 +9,7 @@ from oracle import assert_equal_maps, encoder_of, in_voxels
 from scenes import rough
 
 from taichi_unifusion.kernels import fusion
+from taichi_unifusion.kernels.layout import Layout
 from taichi_unifusion.kernels.regression import TILE
 from taichi_unifusion.maps import PropertyMap, SurfaceMap
 from taichi_unifusion.maps.encoding import EncoderSettings
@@ -103,8 +104,9 @@ def test_fuse_equals_its_twin():
     fused, fused_weights, fused_masks = old.copy(), old_weights.copy(), old_masks.copy()
     # another map's columns come first
     beside = np.concatenate([np.full((40, rows, 3), 9, np.float32), latents], axis=2)
+    layout = Layout(rows, channels)
     fusion.fuse(
-        rows, channels, 3, 40, slots, beside, weights, masks, 1.0, fused, fused_weights, fused_masks
+        layout, 3, 40, slots, beside, weights, masks, 1.0, fused, fused_weights, fused_masks
     )
 
     def voxels(F, w, m, keys):

@@ -11,7 +11,7 @@ from viewpoints import CAMERA, VS, pose
 from taichi_unifusion import SurfaceMap
 from taichi_unifusion.kernels import visibility as kernels
 from taichi_unifusion.maps.encoding import EncoderSettings
-from taichi_unifusion.maps.voxel_grid import VoxelGrid
+from taichi_unifusion.maps.voxel_grid import MASKS, WEIGHTS, VoxelGrid
 
 ENCODER = EncoderSettings(rank=8, anchors=64)
 FLIPPED = 1e-3  # share of cells in which float32 puts a pixel, or a threshold, on the other side
@@ -66,13 +66,10 @@ def vote(voxels: dict, depth: np.ndarray, T: np.ndarray, sign: int, evidence: np
         keys,
         pack_masks(np.array([v.mask for v in voxels.values()])),
         np.array([v.F for v in voxels.values()], np.float32),
-        target._regressor.cell_gradients.to_numpy(),
+        target.cell_gradients.to_numpy(),
         VS,
         depth,
-        CAMERA.fx,
-        CAMERA.fy,
-        CAMERA.cx,
-        CAMERA.cy,
+        CAMERA.intrinsics,
         np.ascontiguousarray(T[:3], np.float32),
         sign,
         evidence,
@@ -152,7 +149,7 @@ def test_add_evidence_equals_its_twin():
 
 
 def test_interpolate_evidence_equals_its_twin():
-    rng, grid = np.random.default_rng(4), VoxelGrid(rows=1, channels=1, evidence=True)
+    rng, grid = np.random.default_rng(4), VoxelGrid([WEIGHTS, MASKS])
     keys = np.unique(rng.integers(-2, 2, (40, 3)), axis=0).astype(np.int32)
     slots = np.empty(len(keys), np.int32)
     grid.claim(len(keys), keys, np.ones(len(keys), np.float32), slots)
@@ -163,7 +160,7 @@ def test_interpolate_evidence_equals_its_twin():
     masks[slots[0]] = False
     x, values = rng.uniform(-2.5, 2.5, (2000, 3)), np.empty(2000, np.float32)
     points = (x * VS).astype(np.float32)
-    kernels.interpolate_evidence(points, 1 / VS, grid.slot, pack_masks(masks), evidence, values)
+    kernels.interpolate_evidence(points, 1 / VS, grid.index, pack_masks(masks), evidence, values)
     by_key = {tuple(key): s for key, s in zip(keys.tolist(), slots, strict=True)}
     wanted = twin.interpolate_evidence(
         {key: evidence[s] for key, s in by_key.items()},

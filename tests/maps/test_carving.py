@@ -111,7 +111,7 @@ def mesh_bytes(target: SurfaceMap) -> tuple[bytes, ...]:
 def test_clouds_without_a_view_never_cut_anything():
     clouds = clouds_of(0.0, POSES[:3])
     blind = mapped([replace(cloud, view=None) for cloud in clouds])
-    data = blind._grid.export()
+    data = blind.voxels()
     assert (
         data.evidence.max() == len(clouds)
         and (data.evidence >= 0).all()
@@ -198,7 +198,7 @@ def carved() -> SurfaceMap:
 def test_evidence_is_saved_and_loaded_bit_for_bit(carved, tmp_path):
     carved.save(tmp_path / "map")
     loaded = load_map(tmp_path / "map")
-    data, again = carved._grid.export(), loaded._grid.export()
+    data, again = carved.voxels(), loaded.voxels()
     assert data.evidence.min() < 0 < data.evidence.max() and data.evidence.dtype == np.int8
     assert again.evidence.tobytes() == data.evidence.tobytes() and mesh_bytes(loaded) == mesh_bytes(
         carved
@@ -211,8 +211,8 @@ def test_growing_pools_keep_the_evidence(carved, monkeypatch):
     monkeypatch.setattr(voxel_grid, "FIRST_CAPACITY", 4)
     small = mapped(clouds_of(0.0, POSES[:3]))
     assert (
-        small._grid.capacity > 4
-        and small._grid.export().evidence.tobytes() == carved._grid.export().evidence.tobytes()
+        small.grid.capacity > 4
+        and small.voxels().evidence.tobytes() == carved.voxels().evidence.tobytes()
     )
 
 
@@ -221,26 +221,22 @@ def test_merging_adds_evidence(carved, tmp_path):
     merged = load_map(tmp_path / "map")
     for votes in (2, 3):
         merged.merge(carved)
-        np.testing.assert_array_equal(
-            merged._grid.export().evidence, votes * carved._grid.export().evidence
-        )
+        np.testing.assert_array_equal(merged.voxels().evidence, votes * carved.voxels().evidence)
     apart = mapped([cloud.transformed(pose((20, 0, 0))) for cloud in clouds_of(0.0, POSES[:2])])
     together = mapped(
         clouds_of(0.0, POSES[:3])
         + [cloud.transformed(pose((20, 0, 0))) for cloud in clouds_of(0.0, POSES[:2])]
     )
     apart.merge(carved)  # where no frame sees the other's voxels, merging is integrating all
-    np.testing.assert_array_equal(apart._grid.export().keys, together._grid.export().keys)
-    np.testing.assert_array_equal(apart._grid.export().evidence, together._grid.export().evidence)
+    np.testing.assert_array_equal(apart.voxels().keys, together.voxels().keys)
+    np.testing.assert_array_equal(apart.voxels().evidence, together.voxels().evidence)
 
 
 def test_without_carve_there_is_no_evidence(tmp_path):
     target = mapped(clouds_of(0.0, POSES[:1]), carve=False)
     target.save(tmp_path / "map")
-    assert (
-        target._grid.export().evidence is None and "evidence" not in read_map(tmp_path / "map")[0]
-    )
-    assert load_map(tmp_path / "map")._grid.export().evidence is None
+    assert target.voxels().evidence is None and "evidence" not in read_map(tmp_path / "map")[0]
+    assert load_map(tmp_path / "map").voxels().evidence is None
 
 
 @pytest.mark.parametrize(
@@ -268,19 +264,19 @@ def test_damaged_evidence_is_refused(carved, tmp_path, damage):
 
 def test_removing_the_last_frame_takes_out_its_votes_and_a_refused_removal_none():
     first, second = clouds_of(0.0, POSES[:2])
-    target, alone = mapped([first]), mapped([first])._grid.export()
+    target, alone = mapped([first]), mapped([first]).voxels()
     target.integrate(second)
     bad = replace(second, points=second.points.copy())
     bad.points[7] = 1e9
-    before = target._grid.export()
+    before = target.voxels()
     with pytest.raises(OutOfRange):
         target.remove(bad)
-    assert target._grid.export().evidence.tobytes() == before.evidence.tobytes()
+    assert target.voxels().evidence.tobytes() == before.evidence.tobytes()
     assert (
         before.evidence[np.isin(_codes(before.keys), _codes(alone.keys))] != alone.evidence
     ).any()
     target.remove(second)
-    after = target._grid.export()
+    after = target.voxels()
     np.testing.assert_array_equal(after.keys, alone.keys)
     np.testing.assert_array_equal(after.evidence, alone.evidence)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import reference
+from encoding_kernels import encode_gradients, encode_positions
 from scipy.special import gamma, kv
 
 from taichi_unifusion.errors import InputError
-from taichi_unifusion.kernels import encoding as kernels
 from taichi_unifusion.maps.encoding import (
     EncoderSettings,
     PositionEncoding,
@@ -118,7 +118,7 @@ def test_nodes_are_cell_centres_x_slowest():
     np.testing.assert_allclose(nodes[3, 0, 1], [0.375, -0.375, -0.125])
 
 
-@pytest.mark.parametrize("wrong", [dict(rank=0), dict(rank=257), dict(length_scale=0.0)])
+@pytest.mark.parametrize("wrong", [{"rank": 0}, {"rank": 257}, {"length_scale": 0.0}])
 def test_settings_that_make_no_encoder_are_refused(wrong):
     with pytest.raises(InputError, match="encoder: "):
         EncoderSettings(**wrong)
@@ -189,7 +189,7 @@ def parameters(encoding: PositionEncoding) -> tuple[np.ndarray, np.ndarray, floa
 @pytest.mark.parametrize("settings", SETTINGS, ids=["default", "small"])
 def test_encode_positions_equals_its_twin(settings, t):
     features = np.empty((len(t), settings.rank), np.float32)
-    kernels.encode_positions(
+    encode_positions(
         settings.rank, t.astype(np.float32), *parameters(PositionEncoding(settings)), features
     )
     np.testing.assert_allclose(
@@ -199,7 +199,7 @@ def test_encode_positions_equals_its_twin(settings, t):
 
 def test_encode_gradients_equals_its_twin(t):
     gradients = np.empty((len(t), 3, SMALL.rank), np.float32)
-    kernels.encode_gradients(
+    encode_gradients(
         SMALL.rank, t.astype(np.float32), *parameters(PositionEncoding(SMALL)), gradients
     )
     twin = reference.encode_gradients(oracle(SMALL), t.astype(np.float32).astype(float))

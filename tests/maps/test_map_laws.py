@@ -33,7 +33,7 @@ FAR = 3e-3
 
 def assert_close(a, b, tolerance: float) -> None:
     """Same voxels, weights and support; latents within a share of the largest."""
-    x, y = a._grid.export(), b._grid.export()
+    x, y = a.voxels(), b.voxels()
     np.testing.assert_array_equal(x.keys, y.keys)
     np.testing.assert_array_equal(x.weights, y.weights)
     np.testing.assert_array_equal(x.masks, y.masks)
@@ -77,9 +77,9 @@ def test_fusing_twice_doubles_weights_and_keeps_latents_and_merging_equals_integ
     a, b, c = frames()
     once = integrated(kind.new(), [a])
     once.save(tmp_path / "a")
-    before = once._grid.export()
+    before = once.voxels()
     once.integrate(a)
-    after = once._grid.export()
+    after = once.voxels()
     np.testing.assert_array_equal(after.keys, before.keys)
     np.testing.assert_array_equal(after.weights, 2 * before.weights)
     np.testing.assert_array_equal(after.masks, before.masks)
@@ -191,7 +191,7 @@ def shifted(kind):
 
 def test_shifting_a_cloud_by_whole_voxels_shifts_the_map(kind, shifted):
     target, steps = shifted
-    data = target._grid.export()
+    data = target.voxels()
     parts = [np.abs(data.keys - step).max(axis=1) < 10 for step in steps]
     assert sum(map(np.count_nonzero, parts)) == len(target) and data.keys[parts[0]].min() < 0
     moves_samples = FLIPPED if kind.name == "surface" else 0
@@ -242,9 +242,9 @@ def test_voxels_at_the_border_of_the_index_range_are_saved_and_loaded(border, tm
 def test_growing_pools_change_nothing(kind, fused, monkeypatch):
     monkeypatch.setattr(voxel_grid, "FIRST_CAPACITY", 4)
     small = kind.new()
-    assert small._grid.capacity == 4
+    assert small.grid.capacity == 4
     integrated(small, frames())
-    assert small._grid.capacity > 4 and content(small) == content(fused)
+    assert small.grid.capacity > 4 and content(small) == content(fused)
 
 
 def test_a_map_that_may_not_grow_is_refused_before_it_changes(kind, fused, monkeypatch, tmp_path):
@@ -263,9 +263,9 @@ def test_strided_clouds_are_read_as_they_are(kind):
     strided = type(a)(wide[:, :3], wide[:, 3:6], {"rgb": wide[:, 6:]})
     target = kind.new()
     target.integrate(strided)
-    before = target._grid.export()
+    before = target.voxels()
     target.integrate(a)
-    after = target._grid.export()
+    after = target.voxels()
     np.testing.assert_array_equal(after.weights, 2 * before.weights)
     np.testing.assert_allclose(
         after.latents, before.latents, atol=1e-6 * np.abs(before.latents).max()

@@ -130,7 +130,7 @@ def classified(patchy):
     cases, edges = np.empty(samples.shape, np.uint8), np.zeros(samples.shape, np.int32)
     triangles = np.empty(len(keys), np.int32)
     kernels.classify_cells(
-        R, upper, support, samples, counts, edge_table, flags, cases, edges, triangles
+        R, upper, support, samples, counts, edge_table, flags, edges, cases, triangles
     )
     return cases, edges, triangles
 

@@ -42,7 +42,7 @@ def answers(target) -> tuple:
 
 
 def content(target) -> tuple[bytes, ...]:
-    data = target._grid.export()
+    data = target.voxels()
     return data.keys.tobytes(), data.latents.tobytes(), data.weights.tobytes(), data.masks.tobytes()
 
 

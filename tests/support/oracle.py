@@ -14,7 +14,7 @@ def assert_equal_maps(
     target, twin: dict[tuple, reference.Voxel], latent_tolerance: float = LATENT
 ) -> None:
     """The map holds exactly the oracle's voxels."""
-    data = target._grid.export()
+    data = target.voxels()
     assert list(map(tuple, data.keys.tolist())) == sorted(twin)
     np.testing.assert_array_equal(data.weights, [twin[key].w for key in sorted(twin)])
     np.testing.assert_array_equal(

@@ -8,8 +8,8 @@ integer, so that the result does not depend on the order of threads.
 
 import taichi as ti
 
+from ...kernels.arrays import Floats2, Ints2, row3
 from ...kernels.camera import Intrinsics, Pose, ray, rotate
-from ...kernels.voxels import Floats2, Ints2, row3
 
 EMPTY = (1 << 63) - 1  # depth buffer value where no triangle is seen
 EDGE = 1e-7  # barycentric slack: pixels on a shared edge belong to both triangles, never to none

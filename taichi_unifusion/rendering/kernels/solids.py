@@ -8,8 +8,8 @@ alone, never on the order of evaluation.
 
 import taichi as ti
 
+from ...kernels.arrays import Floats1, Floats2, Floats3, Ints1, Ints2
 from ...kernels.camera import Intrinsics, ray
-from ...kernels.voxels import Floats1, Floats2, Floats3, Ints1, Ints2
 
 ROOM, BOX, CYLINDER, SPHERE = range(4)
 

@@ -6,8 +6,8 @@ that see a point agree.
 
 import taichi as ti
 
+from ...kernels.arrays import Floats2, Floats3, Ints1, Ints2
 from ...kernels.camera import Intrinsics, Pose, move, ray, rotate
-from ...kernels.voxels import Floats2, Floats3, Ints1, Ints2
 from .raster import Image
 from .solids import CYLINDER, ROOM, SPHERE, TAU, multiply, to_local, uniform
 

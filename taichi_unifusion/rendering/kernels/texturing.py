@@ -8,8 +8,8 @@ McCormack et al. 1999), so that colour aliases neither inside triangles nor at t
 
 import taichi as ti
 
+from ...kernels.arrays import Floats2, Ints1, Ints2, row3
 from ...kernels.camera import Intrinsics, Pose, ray, rotate
-from ...kernels.voxels import Floats2, Ints1, Ints2, row3
 from .raster import EMPTY, DepthBuffer, Image, Projection, depth_of, edge_functions, to_image
 
 MAX_TAPS = 8  # along the long axis of a footprint; longer ones are blurred

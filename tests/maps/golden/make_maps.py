@@ -18,7 +18,7 @@ import numpy as np
 from safetensors.numpy import load_file
 
 import taichi_unifusion as uf
-from taichi_unifusion.maps import LatentMap, PropertyGroup
+from taichi_unifusion.maps import FeatureMap, PropertyGroup
 from taichi_unifusion.maps.encoding import EncoderSettings, position_encoding
 
 FRAMES = (0, 2)  # of a loop of 60: most of what one sees, the other sees too
@@ -49,7 +49,7 @@ def maps(seen: list[uf.PointCloud]) -> dict[str, object]:
         "color-information": uf.PropertyMap("color", 3, fusion="information", voxel_size=0.05),
         "color-points": uf.PropertyMap("color", 3, sampling="points", voxel_size=0.1),
         "color-published": uf.PropertyMap("color", 3, prior="zero", margin=2, voxel_size=0.1),
-        "features": LatentMap("features", 33),
+        "features": FeatureMap("features", 33),
         "removed": uf.SurfaceMap(),
         "removed-information": uf.PropertyMap("color", 3, fusion="information", voxel_size=0.1),
     }

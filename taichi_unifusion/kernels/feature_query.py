@@ -1,14 +1,14 @@
 """Features of a map when they are asked for: texts times rows, the regression of each voxel, its
 value at points (Sec. IV-D).
 
-See `latent.py` for what a voxel keeps.
+See `features.py` for what a voxel keeps.
 """
 
 import taichi as ti
 
-from .latent import Bytes1, Rows2
+from .arrays import Bytes1, Floats1, Floats2, Floats3, Rows2, row3
+from .index import INDEX_HALF, all_within, find, voxel_of
 from .query import nearest_voxel
-from .voxels import INDEX_HALF, Floats1, Floats2, Floats3, all_within, row3, voxel_of
 
 DIRECTIONS = 4  # texts that are worked on at once
 
@@ -17,9 +17,9 @@ DIRECTIONS = 4  # texts that are worked on at once
 def project_rows(
     # in:
     voxels: ti.i32,
-    means: Rows2,
-    slopes: Rows2,
-    scales: Floats2,  # (S, c), (S, q c), (S, q)
+    means: Rows2,  # (S, c)
+    slopes: Rows2,  # (S, q c)
+    scales: Floats2,  # (S, q)
     directions: Floats2,  # (T, c), T a multiple of DIRECTIONS
     # out:
     products: Floats3,  # (S, 1 + q, T)
@@ -48,9 +48,9 @@ def project_rows(
 def take_channels(
     # in:
     voxels: ti.i32,
-    means: Rows2,
-    slopes: Rows2,
-    scales: Floats2,  # (S, c), (S, q c), (S, q)
+    means: Rows2,  # (S, c)
+    slopes: Rows2,  # (S, q c)
+    scales: Floats2,  # (S, q)
     first: ti.i32,
     # out:
     products: Floats3,  # (S, 1 + q, T) channels first .. first + T, as far as there are so many
@@ -89,7 +89,8 @@ def solve_rows(
     weights: Floats1,  # (S,)
     noise: ti.f32,  # d of Eq. 6 for one feature pixel
     # in and out:
-    products: Floats3,  # (S, 1 + q, T) products of mean and slopes -> the constant and the coefficients of f_posi
+    # (S, 1 + q, T) products of mean and slopes -> the constant and the coefficients of f_posi
+    products: Floats3,
 ):
     for s in range(voxels):
         L = ti.Vector([0.0] * (rank * rank))
@@ -150,11 +151,12 @@ def query_products(
     rank: ti.template(),
     points: Floats2,  # (N, 3) world [m]
     per_meter: ti.f32,
-    slot: ti.template(),
+    index: ti.template(),
     products: Floats3,  # (S, 1 + q, T) constants and coefficients, T a multiple of DIRECTIONS
     table: Floats2,  # (nodes^3, q)
     nodes: ti.i32,
-    reach: ti.i32,  # points that no voxel covers take the value of the nearest one within so many voxels
+    # points that no voxel covers take the value of the nearest one within this many voxels
+    reach: ti.i32,
     # out:
     values: Floats2,  # (N, T)
     valid: Bytes1,  # (N,) = 1 where a voxel covers the point
@@ -171,9 +173,9 @@ def query_products(
                 ijk, s = corner, -1
                 if o < 8:
                     ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
-                    s = slot[ijk + INDEX_HALF] - 1
+                    s = find(index, ijk)
                 elif weight == 0 and reach > 0:
-                    s, ijk = nearest_voxel(x, reach, slot)
+                    s, ijk = nearest_voxel(x, reach, index)
                 if s >= 0:
                     at = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
                     tent = 1.0

@@ -13,8 +13,9 @@ import taichi as ti
 from taichi_unifusion import PinholeCamera, PointCloud, load_map
 from taichi_unifusion.errors import FrameError, InputError, MapCorrupt
 from taichi_unifusion.files.maps import read_map, write_map
-from taichi_unifusion.kernels import latent, latent_query
-from taichi_unifusion.maps import LatentMap
+from taichi_unifusion.kernels import feature_query
+from taichi_unifusion.kernels import features as kernels
+from taichi_unifusion.maps import FeatureMap
 from taichi_unifusion.types import ImageView
 
 # table of position features, half precision, slopes of 255 levels
@@ -56,15 +57,15 @@ def view(seed: int, channels: int = 20, count: int = 4000, values=None) -> Point
     return PointCloud(points, features={"clip": image})
 
 
-def made(*clouds: PointCloud, **settings) -> LatentMap:
+def made(*clouds: PointCloud, **settings) -> FeatureMap:
     channels = clouds[0].features["clip"].values.shape[2]
-    target = LatentMap("clip", channels, voxel_size=VOXEL, **settings)
+    target = FeatureMap("clip", channels, voxel_size=VOXEL, **settings)
     for cloud in clouds:
         target.integrate(cloud)
     return target
 
 
-def answers(target: LatentMap, points=None):
+def answers(target: FeatureMap, points=None):
     points = view(9).points[::5] if points is None else points
     values, valid = target.query(points, return_valid=True)
     assert valid.mean() > 0.9
@@ -84,7 +85,7 @@ def target(clouds):
 def test_every_kernel_has_a_twin_of_its_name():
     names = {
         name
-        for module in (latent, latent_query)
+        for module in (kernels, feature_query)
         for name, value in vars(module).items()
         if getattr(value, "_is_wrapped_kernel", False)
     }
@@ -150,15 +151,15 @@ def random_rows(rng, voxels, slope_rows, channels):
 def test_small_kernels_equal_their_twins():
     rng = np.random.default_rng(0)
     rows = random_rows(rng, 7, 3, 20)
-    directions = rng.standard_normal((latent_query.DIRECTIONS, 20)).astype(np.float32)
-    products = np.empty((7, 4, latent_query.DIRECTIONS), np.float32)
-    latent_query.project_rows(7, *rows, directions, products)
+    directions = rng.standard_normal((feature_query.DIRECTIONS, 20)).astype(np.float32)
+    products = np.empty((7, 4, feature_query.DIRECTIONS), np.float32)
+    feature_query.project_rows(7, *rows, directions, products)
     np.testing.assert_allclose(products, twin.project_rows(*rows, directions), atol=1e-4)
     channels = np.empty((7, 4, 6), np.float32)
-    latent_query.take_channels(7, *rows, 5, channels)
+    feature_query.take_channels(7, *rows, 5, channels)
     np.testing.assert_allclose(channels, twin.take_channels(*rows, 5, 6), rtol=1e-6)
     lengths = np.empty(7, np.float32)
-    latent_query.mean_lengths(7, rows[0], lengths)
+    feature_query.mean_lengths(7, rows[0], lengths)
     np.testing.assert_allclose(lengths, twin.mean_lengths(rows[0]), rtol=1e-5)
 
 
@@ -188,22 +189,23 @@ def test_voxels_fuse_as_their_twin():
     ]
     fused = [array.copy() for array in a]
     fused_moments, fused_weights = moments[0].copy(), weights[0].copy()
-    target = LatentMap("clip", c)
-    latent.fuse_voxels(
-        q,
-        True,
-        n,
+    target = FeatureMap("clip", c)
+    pools = kernels.FeaturePools(
+        means=fused[0],
+        slopes=fused[1],
+        scales=fused[2],
+        moments=fused_moments,
+        weights=fused_weights,
+    )
+    kernels.fuse_voxels(
+        target.layout,
         np.arange(3 * n, dtype=np.int32).reshape(n, 3),
         np.arange(n, dtype=np.int32),
         *b,
         moments[1],
         weights[1],
-        target._workers,
-        target._stride,
-        target._scratch[-1],
-        *fused,
-        fused_moments,
-        fused_weights,
+        target._scratch,
+        pools,
     )
     ti.sync()
     found = twin.decoded_rows(*fused)
@@ -211,7 +213,7 @@ def test_voxels_fuse_as_their_twin():
         assert np.abs(found[i, 0] - mean).max() < HALF * np.abs(mean).max()
         assert (np.abs(found[i, 1:] - slopes) < 1.001 * fused[2][i][:, None]).all()
         np.testing.assert_allclose(
-            np.abs(slopes).max(axis=1) / fused[2][i], latent.LEVELS, rtol=1e-4
+            np.abs(slopes).max(axis=1) / fused[2][i], kernels.LEVELS, rtol=1e-4
         )
     share = (weights[1] / weights.sum(axis=0))[:, None, None]
     np.testing.assert_allclose(
@@ -290,7 +292,7 @@ def test_the_same_frames_give_the_same_bits(clouds, target, tmp_path):
 def test_a_saved_map_answers_the_same(target, tmp_path):
     target.save(tmp_path / "clip.safetensors")
     loaded = load_map(tmp_path / "clip.safetensors")
-    assert isinstance(loaded, LatentMap) and loaded.settings == target.settings
+    assert isinstance(loaded, FeatureMap) and loaded.settings == target.settings
     assert (answers(loaded) == answers(target)).all()
 
 
@@ -372,7 +374,7 @@ def test_shapes_and_empty_maps(target):
         points, texts[:1]
     ).shape == (7, 1)
     assert target.similarity(np.zeros((0, 3)), texts).shape == (0, 20)
-    values, valid = LatentMap("clip", 20).similarity(points, texts, return_valid=True)
+    values, valid = FeatureMap("clip", 20).similarity(points, texts, return_valid=True)
     assert not valid.any() and (values == 0).all()
     # more texts than are multiplied at once
     many = np.random.default_rng(0).standard_normal((150, 20))
@@ -404,7 +406,7 @@ def test_uncertainty_is_what_noise_does():
 @pytest.mark.parametrize("channels", [512, 768])
 def test_a_voxel_takes_an_eighth_of_the_published_bytes(channels):
     # leaves of the index as full as on real surfaces
-    target = LatentMap("clip", channels, voxel_size=VOXEL / 3)
+    target = FeatureMap("clip", channels, voxel_size=VOXEL / 3)
     target.integrate(view(0, channels=channels))
     assert (
         len(target) > 500 and target.memory_bytes / len(target) <= PUBLISHED_ROWS * channels * 4 / 8
@@ -418,7 +420,7 @@ def test_a_map_grows_beyond_its_first_room():
     cloud = view(
         0, channels=4, count=120_000, values=np.broadcast_to([1.0, 2.0, 3.0, 4.0], (18, 24, 4))
     )
-    target = LatentMap("clip", 4, voxel_size=0.01)
+    target = FeatureMap("clip", 4, voxel_size=0.01)
     for rows in np.array_split(np.argsort(cloud.points[:, 0]), 4):
         target.integrate(
             PointCloud(np.ascontiguousarray(cloud.points[rows]), features=cloud.features)

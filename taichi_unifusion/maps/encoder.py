@@ -1,0 +1,203 @@
+"""Encoder: binned points -> the local LIM, by one small regression a voxel (Eq. 6, 17, 18); and
+Decoder: latents -> values at points (Eq. 7).
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..kernels import query, regression
+from ..kernels.cells import CELLS
+from ..kernels.layout import Layout
+from ..runtime import DeviceArray, Runtime
+from .encoding import position_encoding
+from .local_lim import Binned, LocalLim, SortedSamples
+from .settings import MapSettings
+from .voxel_grid import VoxelGrid
+
+CPU_WORKERS, GPU_WORKERS = 64, 8192
+
+
+class Encoder:
+    """Tables of the position encoding on the device, and the regression that uses them.
+
+    `layout` says how many targets a sample has, and whether F or the sums of the regression are
+    wanted.
+    """
+
+    def __init__(self, runtime: Runtime, settings: MapSettings, layout: Layout) -> None:
+        self.layout, self.arena = layout, runtime.arena
+        self.min_points, self.noise = settings.min_points, settings.noise
+        self.tables = PositionTables(settings)
+        self.window = window_masks(settings.margin)
+        self.cell_features = to_device(self._cell_features())
+        self.tiles = _tiles(runtime, layout)
+
+    def _cell_features(self) -> NDArray[np.float64]:
+        """(8^3, 1 or 4, size): f_posi, and its gradient by voxel units, at the cell centres of a
+        doubled voxel.
+        """
+        encoding, rank = self.tables.encoding, self.layout.rank
+        t = encoding.nodes(2 * CELLS)
+        table = np.zeros((len(t), 4 if self.layout.derivatives else 1, self.layout.size))
+        table[:, 0, :rank] = encoding(t)
+        if self.layout.derivatives:
+            table[:, 1:, :rank] = 0.5 * encoding.gradient(t)  # t moves by 1/2 a voxel
+        return table
+
+    def encode(self, binned: Binned) -> LocalLim:
+        """Encode the averages in cells."""
+        self.arena.check_loan(binned.turn)
+        encoded, weights = self._room(binned.count)
+        regression.encode_cells(
+            self.layout,
+            binned.count,
+            binned.neighbors,
+            binned.masks,
+            self.window,
+            binned.totals,
+            binned.starts,
+            binned.cells,
+            self.cell_features,
+            self.min_points,
+            self.noise,
+            self.tiles,
+            weights,
+            encoded,
+        )
+        return self._local(binned, encoded, weights)
+
+    def encode_samples(self, samples: SortedSamples) -> LocalLim:
+        """Encode every sample as it is, as published."""
+        self.arena.check_loan(samples.turn)
+        encoded, weights = self._room(samples.count)
+        regression.encode_points(
+            self.layout,
+            samples.keys,
+            samples.neighbors,
+            samples.starts,
+            samples.samples,
+            samples.targets,
+            self.tables.anchors,
+            self.tables.projection,
+            self.tables.scale,
+            self.min_points,
+            self.noise,
+            self.tiles,
+            weights,
+            encoded,
+        )
+        return self._local(samples, encoded, weights)
+
+    def _room(self, blocks: int) -> tuple[DeviceArray, DeviceArray]:
+        """Arrays for what is encoded, (B, r, c) or (B, q, 1), and the weights (B,)."""
+        layout = self.layout
+        row = (layout.sums, 1) if layout.information else (layout.latent_rows, layout.channels)
+        return (
+            self.arena.borrow("encoded", ti.f32, (blocks, *row)),
+            self.arena.borrow("weights", ti.f32, (blocks,)),
+        )
+
+    def _local(
+        self, source: Binned | SortedSamples, encoded: DeviceArray, weights: DeviceArray
+    ) -> LocalLim:
+        return LocalLim(
+            source.turn,
+            source.count,
+            source.keys,
+            encoded,
+            weights,
+            source.support,
+            self.layout.channels,
+        )
+
+
+class PositionTables:
+    """What kernels need to evaluate f_posi exactly."""
+
+    def __init__(self, settings: MapSettings) -> None:
+        self.encoding = position_encoding(settings.encoder)
+        self.scale = float(np.sqrt(7.0) / settings.encoder.length_scale)
+        self.anchors = to_device((self.encoding.anchors * self.scale).T)  # (3, A)
+        self.projection = to_device(self.encoding.projection.T)  # (l, A)
+
+
+class Decoder:
+    """Values of a grid's latents at points: f_dec(x, F) = f_posi(t) F."""
+
+    def __init__(self, tables: PositionTables, layout: Layout, voxel_size: float) -> None:
+        self.tables, self.layout, self.voxel_size = tables, layout, voxel_size
+
+    def decode(
+        self, grid: VoxelGrid, points: NDArray, blend: bool, reach: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Decoded values (N, c) and where a voxel covers (N,), at points (N, 3) world [m].
+
+        `blend` and `reach` are those of `kernels.query.query_points`.
+        """
+        points = check_points(points)
+        values = np.zeros((len(points), self.layout.channels), np.float32)
+        valid = np.zeros(len(points), np.uint8)
+        if len(points):
+            query.query_points(
+                self.layout,
+                blend,
+                points,
+                1.0 / self.voxel_size,
+                grid.index,
+                grid["latents"],
+                self.tables.anchors,
+                self.tables.projection,
+                self.tables.scale,
+                reach,
+                values,
+                valid,
+            )
+        return values, valid.astype(bool)
+
+
+def check_points(points: NDArray) -> NDArray[np.float32]:
+    """Points (N, 3) as kernels take them; raises InputError for another shape."""
+    points = np.ascontiguousarray(points, dtype=np.float32)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"query: points must be (N, 3), got {points.shape}")
+    return points
+
+
+def window_masks(margin: int) -> DeviceArray:
+    """(27, 2): the cells of each of the 27 neighbours within `margin` cells of a voxel, as bits."""
+    halves = {-1: range(CELLS - margin, CELLS), 0: range(CELLS), 1: range(margin)}
+    masks = np.zeros((27, 2), np.uint32)
+    for o, steps in enumerate(product((-1, 0, 1), repeat=3)):
+        for i, j, k in product(*(halves[step] for step in steps)):
+            cell = (i * CELLS + j) * CELLS + k
+            masks[o, cell // 32] |= np.uint32(1 << (31 - cell % 32))
+    on_device = ti.ndarray(ti.u32, masks.shape)
+    on_device.from_numpy(masks)
+    return on_device
+
+
+def workers(runtime: Runtime) -> int:
+    """How many workers share the voxels of a frame."""
+    return CPU_WORKERS if runtime.device == "cpu" else GPU_WORKERS
+
+
+def _tiles(runtime: Runtime, layout: Layout) -> ti.Field:
+    """Scratch of the workers, one for all maps of a runtime; a field, because its strides are known
+    when compiling.
+    """
+    shape = (workers(runtime), layout.rows, regression.TILE)
+    return runtime.arena.exact("tiles", lambda: ti.field(ti.f32, shape), shape)
+
+
+def to_device(array: NDArray) -> DeviceArray:
+    """A float32 copy of an array on the device."""
+    array = np.ascontiguousarray(array, dtype=np.float32)
+    on_device = ti.ndarray(ti.f32, array.shape)
+    on_device.from_numpy(array)
+    return on_device

@@ -1,0 +1,77 @@
+"""Pools: the data of voxels, a row each, on the device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import prod
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from ..errors import CapacityError
+from ..kernels.pools import copy_rows, gather_rows
+from ..runtime import DeviceArray
+
+MAX_ELEMENTS = 2**31 - 1  # of an array of Taichi
+_TAICHI = {
+    np.dtype(np.float32): ti.f32,
+    np.dtype(np.float16): ti.f16,
+    np.dtype(np.int32): ti.i32,
+    np.dtype(np.int8): ti.i8,
+    np.dtype(np.uint32): ti.u32,
+}
+
+
+@dataclass(frozen=True)
+class VoxelField:
+    """What one pool holds of every voxel; storage, export, files and checks all go by it."""
+
+    name: str  # of the pool, and of the tensor in a map file
+    dtype: np.dtype
+    shape: tuple[int, ...] = ()  # of one voxel
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of one voxel."""
+        return self.dtype.itemsize * prod(self.shape)
+
+
+class Pool:
+    """Rows of one field on the device; more room keeps what they hold."""
+
+    def __init__(self, field: VoxelField, capacity: int) -> None:
+        self.field = field
+        self.array: DeviceArray = self._allocate(capacity)
+
+    def _allocate(self, capacity: int) -> DeviceArray:
+        return ti.ndarray(_TAICHI[self.field.dtype], (capacity, *self.field.shape))
+
+    @property
+    def capacity(self) -> int:
+        return self.array.shape[0]
+
+    def check_room(self, rows: int, used: int) -> None:
+        """Raise CapacityError where `rows` rows are more than an array of Taichi can hold."""
+        if rows * prod(self.field.shape) > MAX_ELEMENTS:
+            numbers = " x ".join(map(str, self.field.shape))
+            raise CapacityError(
+                f"the map holds {used:,} voxels of {numbers} numbers, as many as fit into an "
+                "array: use larger voxels or save the map and start a new one"
+            )
+
+    def reserve(self, rows: int, used: int) -> None:
+        """Make room for `rows` rows, of which the first `used` are kept."""
+        if rows <= self.capacity:
+            return
+        old = self.array
+        self.array = self._allocate(rows)
+        if used:
+            copy_rows(used, old, self.array)
+
+    def take(self, slots: NDArray[np.int32]) -> NDArray:
+        """The rows in `slots`, in order, by value."""
+        rows = np.empty((len(slots), *self.field.shape), self.field.dtype)
+        if rows.size:
+            gather_rows(slots, self.array, rows)
+        return rows

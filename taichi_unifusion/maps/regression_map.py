@@ -1,0 +1,181 @@
+"""RegressionMap: a LIM that is regressed from a cloud's points, voxel by voxel, and fused frame by
+frame (Fig. 5).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import runtime
+from ..kernels import fusion
+from ..kernels.layout import Layout
+from ..types import PointCloud
+from .base_map import BaseMap, Integration, S
+from .encoder import Decoder, Encoder
+from .local_lim import LocalLim
+from .voxel_grid import MASKS, WEIGHTS, VoxelData, VoxelField, VoxelGrid, latents
+
+
+class RegressionGrid(VoxelGrid):
+    """The voxels of a regression map, into which local LIMs are fused (Eq. 19)."""
+
+    def __init__(self, layout: Layout, noise: float, more: Sequence[VoxelField] = ()) -> None:
+        sums = [VoxelField("sums", np.dtype(np.float32), (layout.sums,))] * layout.information
+        super().__init__(
+            [latents(layout.latent_rows, layout.channels), WEIGHTS, MASKS, *more, *sums]
+        )
+        self.layout, self.noise = layout, noise
+
+    def fuse(self, local: LocalLim) -> int:
+        """F <- (F w + F' w') / (w + w'), or the sums of one regression over all frames; returns the
+        number of voxels that the local LIM holds.
+
+        Raises RuntimeStateError for a local LIM whose loan is over, CapacityError, with the grid
+        unchanged.
+        """
+        self.runtime.arena.check_loan(local.turn)
+        slots = np.empty(local.count, np.int32)
+        encoded = self.claim(local.count, local.keys, local.weights, slots)
+        self._fuse(local, slots, 1.0)
+        return encoded
+
+    def take_out(self, local: LocalLim) -> int:
+        """Undo `fuse`; returns the number of voxels that it touched.
+
+        Support is not cleared: other frames may have set it.
+        """
+        self.runtime.arena.check_loan(local.turn)
+        slots = np.empty(local.count, np.int32)
+        known = self.find(local.count, local.keys, local.weights, slots)
+        self._fuse(local, slots, -1.0)
+        self.release(local.count, local.keys, slots)
+        return known
+
+    def _fuse(self, local: LocalLim, slots: NDArray[np.int32], sign: float) -> None:
+        support = local.support if sign > 0 else np.zeros((local.count, 2), np.uint32)
+        if self.layout.information:
+            fusion.fuse_information(
+                self.layout,
+                local.first,
+                local.channels,
+                local.count,
+                slots,
+                local.encoded,
+                local.weights,
+                support,
+                sign,
+                self.noise,
+                self["sums"],
+                self["weights"],
+                self["masks"],
+                self["latents"],
+            )
+        else:
+            fusion.fuse(
+                self.layout,
+                local.first,
+                local.count,
+                slots,
+                local.encoded,
+                local.weights,
+                support,
+                sign,
+                self["latents"],
+                self["weights"],
+                self["masks"],
+            )
+
+
+class RegressionMap(BaseMap[S]):
+    """A map that a subclass gives (x, y) pairs: `observed` and `encode`."""
+
+    def __init__(
+        self,
+        name: str,
+        channels: int,
+        settings: S,
+        *,
+        centered: bool,
+        derivatives: bool = False,
+        fields: Sequence[VoxelField] = (),
+    ) -> None:
+        self.layout = Layout(
+            settings.encoder.rank,
+            channels,
+            centered,
+            derivatives,
+            settings.fusion == "information",
+        )
+        self.grid: RegressionGrid = RegressionGrid(self.layout, settings.noise, fields)
+        super().__init__(name, channels, settings, self.grid)
+        self.encoder = Encoder(self.grid.runtime, settings, self.layout)
+        self.decoder = Decoder(self.encoder.tables, self.layout, settings.voxel_size)
+
+    def integrate(self, cloud: PointCloud) -> Integration:
+        runtime.check_alive(self.grid.runtime)
+        cloud = self.usable(cloud)
+        if len(cloud) == 0:
+            return Integration(0, 0, len(self))
+        local = self.encode(cloud)  # local LIM: F', w' of every voxel that the cloud touches
+        encoded = self.grid.fuse(local)  # global LIM, Eq. 19
+        self.learn_visibility(cloud, local, 1)
+        return Integration(len(cloud), encoded, len(self))
+
+    integrate.__doc__ = BaseMap.integrate.__doc__
+
+    def remove(self, cloud: PointCloud) -> Integration:
+        """Take a cloud out again that was integrated, for example to integrate it at a better pose;
+        errors as `integrate`.
+
+        Latents and weights become what they were without it, up to rounding. Support bits are not
+        cleared; evidence is undone only where frames since have not changed the surface. Removing
+        what was never integrated spoils the voxels that it touches.
+        """
+        runtime.check_alive(self.grid.runtime)
+        cloud = self.usable(cloud)
+        if len(cloud) == 0:
+            return Integration(0, 0, len(self))
+        local = self.encode(cloud)  # first: it may raise, and then the map must be unchanged
+        self.learn_visibility(cloud, local, -1)
+        return Integration(len(cloud), self.grid.take_out(local), len(self))
+
+    @abstractmethod
+    def observed(self, cloud: PointCloud) -> NDArray[np.float32]:
+        """What this map takes from the cloud beside its points, (N, c); raises InputError where
+        that is missing.
+        """
+
+    @abstractmethod
+    def encode(self, cloud: PointCloud) -> LocalLim:
+        """The local LIM of a cloud without points that are not usable, on loan until the next."""
+
+    def learn_visibility(self, cloud: PointCloud, local: LocalLim, sign: int) -> None:
+        """Hook: update evidence from the cloud's depth image, after it was fused (sign 1) or before
+        it is taken out (-1). Only SurfaceMap does.
+        """
+
+    def usable(self, cloud: PointCloud) -> PointCloud:
+        """The cloud without the points at which something observed is NaN or infinite."""
+        observed = self.observed(cloud)
+        if np.isfinite(observed.sum()):  # one pass; a sum is finite only if all its terms are
+            return cloud
+        return cloud.take(np.flatnonzero(np.isfinite(observed).all(axis=1)))
+
+    def _fuse_voxels(self, data: VoxelData) -> None:
+        if len(data) == 0:
+            return
+        sums = data.sums
+        local = LocalLim(
+            None,
+            len(data),
+            data.keys,
+            data.latents if sums is None else sums[:, :, None],
+            data.weights,
+            data.masks,
+            self.channels,
+        )
+        self.grid.fuse(local)

@@ -1,0 +1,184 @@
+"""Voxel index and pools: slots, growth, what is given up, and the reuse of trees."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+import reference
+from scenes import moved, rough
+
+from taichi_unifusion import runtime
+from taichi_unifusion.errors import CapacityError, RuntimeStateError
+from taichi_unifusion.kernels import index as kernels
+from taichi_unifusion.maps import voxel_grid
+from taichi_unifusion.maps.binner import Binner
+from taichi_unifusion.maps.pool import VoxelField
+from taichi_unifusion.maps.voxel_grid import EVIDENCE, MASKS, WEIGHTS, VoxelGrid, latents
+
+VS = 0.05
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    return rough(0, 1200)
+
+
+def a_grid(*fields: VoxelField) -> VoxelGrid:
+    return VoxelGrid([WEIGHTS, MASKS, *(fields or (latents(1, 1),))])
+
+
+def in_voxels(points) -> np.ndarray:
+    """Positions [voxels] as the kernels compute them, so that no point changes its cell."""
+    return (points * np.float32(1 / VS)).astype(float)
+
+
+def touch(grid: VoxelGrid, points) -> np.ndarray:
+    """Voxels (B, 3) that points touch in a new frame."""
+    keys, counters = np.zeros((4000, 3), np.int32), np.zeros(2, np.int32)
+    kernels.touch_points(points, 1 / VS, grid.next_frame(), 32, False, grid.index, counters, keys)
+    return keys[: counters[0]].copy()
+
+
+def test_claim_gather_and_copy_equal_a_dict(cloud):
+    """Slots are given once, in any order; export is sorted; growth keeps everything."""
+    grid, kept, rng = a_grid(latents(2, 3)), {}, np.random.default_rng(4)
+    for _ in range(3):
+        # more than the first room in total
+        keys = np.unique(rng.integers(-20, 20, (3000, 3)), axis=0).astype(np.int32)
+        weights = rng.integers(0, 3, len(keys)).astype(np.float32)
+        slots = np.empty(len(keys), np.int32)
+        wanted = grid.claim(len(keys), keys, weights, slots)
+        assert wanted == np.count_nonzero(weights) and ((slots >= 0) == (weights > 0)).all()
+        for key, slot in zip(map(tuple, keys.tolist()), slots.tolist(), strict=True):
+            if slot >= 0:
+                assert kept.setdefault(key, slot) == slot
+    assert grid.count == len(kept) > voxel_grid.FIRST_CAPACITY and sorted(kept.values()) == list(
+        range(len(kept))
+    )
+    values = rng.normal(size=(grid.capacity, 2, 3)).astype(np.float32)
+    grid["latents"].from_numpy(values)
+    grid["weights"].from_numpy(values[:, 0, 0].copy())
+    grid["masks"].from_numpy(rng.integers(0, 2**32, (grid.capacity, 2), dtype=np.uint32))
+    masks = grid["masks"].to_numpy()
+    grid.reserve(grid.capacity)  # moves all to a larger pool
+    data = grid.export()
+    assert list(map(tuple, data.keys.tolist())) == sorted(kept)
+    order = [kept[key] for key in sorted(kept)]
+    for found, written in (
+        (data.latents, values),
+        (data.weights, values[:, 0, 0]),
+        (data.masks, masks),
+    ):
+        np.testing.assert_array_equal(found, written[order])
+
+
+def test_find_release_and_row_copies_equal_a_dict():
+    """A voxel without weight is given up, the others stay; rows follow their slots into a larger
+    pool and out of it.
+    """
+    grid, rng = (
+        a_grid(latents(1, 1), EVIDENCE, VoxelField("sums", np.dtype(np.float32), (7,))),
+        np.random.default_rng(5),
+    )
+    keys = np.unique(rng.integers(-9, 9, (500, 3)), axis=0).astype(np.int32)
+    ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
+    grid.claim(len(keys), keys, ones, slots)
+    weights = rng.integers(0, 2, grid.capacity).astype(np.float32)
+    evidence = rng.integers(-127, 128, (grid.capacity, 64), dtype=np.int8)
+    sums = rng.normal(size=(grid.capacity, 7)).astype(np.float32)
+    for pool, values in (
+        (grid["weights"], weights),
+        (grid["evidence"], evidence),
+        (grid["sums"], sums),
+    ):
+        pool.from_numpy(values)
+    given = np.where(np.arange(len(keys)) % 3 == 0, -1, slots).astype(np.int32)  # -1: not asked for
+    grid.release(len(keys), keys, given)
+    gone = (given >= 0) & (weights[slots] == 0)
+    assert 0 < gone.sum() == grid.empty and len(grid) == len(keys) - gone.sum()
+    found, wanted = np.empty(len(keys), np.int32), (np.arange(len(keys)) % 2).astype(np.float32)
+    absent = keys + np.int32(100)
+    assert grid.find(len(keys), keys, wanted, found) == (~gone & (wanted > 0)).sum()
+    np.testing.assert_array_equal(found, np.where(~gone & (wanted > 0), slots, -1))
+    assert grid.find(len(keys), absent, ones, found) == 0 and (found == -1).all()
+    weights[slots[(weights[slots] == 0) & ~gone]] = 1  # a map holds no voxel without weight
+    grid["weights"].from_numpy(weights)
+    grid.reserve(grid.capacity)
+    data = grid.export()
+    assert list(map(tuple, data.keys.tolist())) == sorted(map(tuple, keys[~gone].tolist()))
+    order = slots[~gone][np.lexsort(keys[~gone].T[::-1])]
+    np.testing.assert_array_equal(data.evidence, evidence[order])
+    np.testing.assert_array_equal(data.sums, sums[order])
+
+
+def test_count_leaves_counts_4x4x4_groups_of_voxels():
+    grid = a_grid()
+    assert kernels.count_leaves(grid.index) == 0
+    keys = np.array([[0, 0, 0], [3, 3, 3], [4, 0, 0], [-1, 0, 0], [8191, -8192, 8191]])
+    touch(grid, ((keys[:4] + 0.5) * VS).astype(np.float32))
+    assert kernels.count_leaves(grid.index) == len(np.unique(keys[:4] // 4, axis=0)) == 3
+
+
+def test_forty_maps_one_after_the_other_share_a_tree_that_starts_empty(cloud):
+    gc.collect()
+    grid = a_grid()
+    tree, trees = grid.index, runtime.current().trees
+    for n in range(40):
+        assert grid.index is tree and grid.count == 0 and kernels.count_leaves(grid.index) == 0
+        here = moved(cloud, (n * VS, 0, 0))
+        keys = touch(grid, here.points)
+        assert set(map(tuple, keys.tolist())) == reference.touch_points(in_voxels(here.points))
+        slots, ones = np.empty(len(keys), np.int32), np.ones(len(keys), np.float32)
+        assert grid.claim(len(keys), keys, ones, slots) == len(keys) == grid.count
+        grid = None  # gives its tree back before the next one asks
+        grid = a_grid()
+    assert runtime.current().trees == trees
+
+
+def test_more_live_maps_than_taichi_bears_are_refused(monkeypatch):
+    live = runtime.current()
+    monkeypatch.setattr(runtime, "MAX_TREES", live.trees)
+    free = [a_grid() for _ in live.free_trees.copy()]
+    with pytest.raises(CapacityError, match="maps live at once: .*save"):
+        a_grid()
+    del free
+    a_grid()
+
+
+def test_an_index_that_would_pass_safe_memory_is_refused(monkeypatch):
+    grid = a_grid()
+    keys = (
+        np.stack(np.meshgrid(*[np.arange(0, 60, 4)] * 3), axis=-1).reshape(-1, 3).astype(np.int32)
+    )
+    ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
+    assert grid.claim(len(keys), keys, ones, slots) == len(keys)
+    monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * (len(keys) - 1))
+    monkeypatch.setattr(voxel_grid, "CHECK_EVERY", 0)
+    with pytest.raises(CapacityError, match="3,375 voxels .* larger voxels or save"):
+        grid.claim(len(keys), keys + 400, ones, slots)
+    assert grid.count == len(keys)
+
+
+def test_lone_points_that_make_no_voxel_also_count_against_safe_memory(monkeypatch):
+    """Every touched voxel takes sparse memory, also where too few points fell to encode it."""
+    grid = a_grid()
+    rng = np.random.default_rng(8)
+    monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * 5000)
+    monkeypatch.setattr(voxel_grid, "CHECK_EVERY", 2000)
+    with pytest.raises(CapacityError, match="larger voxels or save"):
+        for _ in range(20):
+            keys = touch(grid, rng.uniform(-200, 200, (1000, 3)).astype(np.float32))
+            grid.claim(
+                len(keys), keys, np.zeros(len(keys), np.float32), np.empty(len(keys), np.int32)
+            )
+
+
+def test_a_grid_of_another_runtime_is_refused(cloud, monkeypatch):
+    grid = a_grid()
+    monkeypatch.setattr(runtime, "_runtime", runtime.Runtime("cpu", "another one"))
+    with pytest.raises(RuntimeStateError, match="before Taichi was started again"):
+        grid.export()
+    with pytest.raises(RuntimeStateError, match="before Taichi was started again"):
+        Binner(grid, VS, 1).bin(cloud.points, [cloud.attributes["one"]])
