@@ -1,7 +1,7 @@
 # From a bare Debian or Ubuntu machine with Python 3.11-3.13 to a result: `make demo`, `make test`.
 # `make demo PYTHON=python3.12` chooses the interpreter; `make test PYTEST_ARGS="-k surface"` hands options to pytest.
 # WORKERS processes share the tests, a file at a time, so that fixtures of a file are made once; each takes 1 to 2 GB.
-.PHONY: demo test lint format setup
+.PHONY: demo test lint types format setup
 
 WORKERS ?= 2
 
@@ -17,6 +17,9 @@ test: setup
 lint: setup
 	.venv/bin/ruff check
 	.venv/bin/ruff format --check
+
+types: setup
+	.venv/bin/basedpyright --pythonpath .venv/bin/python --level error
 
 format: setup
 	.venv/bin/ruff check --fix
