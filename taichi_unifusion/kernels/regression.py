@@ -98,6 +98,9 @@ def flush(
 ):
     """Add what a worker's tile holds to G, first clearing the columns that round it up to a
     multiple of 16.
+
+    It is most of what a kernel compiles, so kernels call it in one place: when the tile is full,
+    and in a round after the last neighbour for what is left.
     """
     for row in range(layout.rows):
         for k in range(filled, (filled + 15) // 16 * 16):
@@ -262,44 +265,50 @@ def encode_cells(
                     G = ti.Vector([0.0] * (layout.rows * size))
                     mean = ti.Vector([0.0] * channels)
                     filled, weight = 0, 0.0
-                    for o in range(27):
-                        b, step = neighbors[v, o], neighbor_step(o)
+                    for o in range(28):  # the last round has no neighbour, see `flush`
+                        last = o == 27
+                        b, step = v, neighbor_step(o)
+                        if not last:
+                            b = neighbors[v, o]
                         if b >= 0:
                             first = starts[b]
                             for half in range(2):
                                 occupied = masks[b, half]
-                                wanted = occupied & window[o, half]
+                                wanted = ti.u32(1)
+                                if not last:
+                                    wanted = occupied & window[o, half]
                                 while wanted != 0:
-                                    k = first_cell(wanted)
-                                    wanted ^= cell_bit(k)
-                                    n = first + cells_before(occupied, k)
-                                    at = cell_row(half * 32 + k, step)
-                                    root = cells[n, 0]
-                                    for a in ti.static(range(size)):
-                                        tiles[worker, a, filled] = features[at, 0, a] * root
-                                    for c in ti.static(range(channels)):
-                                        y = cells[n, 1 + c]
-                                        tiles[worker, size + c, filled] = y
-                                        mean[c] += y * root
-                                    if ti.static(layout.centered):
-                                        tiles[worker, size + channels, filled] = root
-                                    filled += 1
-                                    if ti.static(layout.derivatives):
-                                        # Eq. 16: one more row an axis, its target the normal
-                                        for axis in ti.static(range(3)):
-                                            for a in ti.static(range(size)):
-                                                tiles[worker, a, filled] = (
-                                                    features[at, 1 + axis, a] * root
-                                                )
-                                            tiles[worker, size, filled] = cells[n, 2 + axis]
-                                            filled += 1
-                                    weight += root * root
-                                    if filled > TILE - 4:
+                                    if last:
+                                        wanted = ti.u32(0)
+                                    else:
+                                        k = first_cell(wanted)
+                                        wanted ^= cell_bit(k)
+                                        n = first + cells_before(occupied, k)
+                                        at = cell_row(half * 32 + k, step)
+                                        root = cells[n, 0]
+                                        for a in ti.static(range(size)):
+                                            tiles[worker, a, filled] = features[at, 0, a] * root
+                                        for c in ti.static(range(channels)):
+                                            y = cells[n, 1 + c]
+                                            tiles[worker, size + c, filled] = y
+                                            mean[c] += y * root
+                                        if ti.static(layout.centered):
+                                            tiles[worker, size + channels, filled] = root
+                                        filled += 1
+                                        if ti.static(layout.derivatives):
+                                            # Eq. 16: one more row an axis, its target the normal
+                                            for axis in ti.static(range(3)):
+                                                for a in ti.static(range(size)):
+                                                    tiles[worker, a, filled] = (
+                                                        features[at, 1 + axis, a] * root
+                                                    )
+                                                tiles[worker, size, filled] = cells[n, 2 + axis]
+                                                filled += 1
+                                        weight += root * root
+                                    if filled > TILE - 4 or (last and filled > 0):
                                         flush(layout, worker, filled, tiles, G)
                                         filled = 0
                                 first += ti.cast(ti.math.popcnt(occupied), ti.i32)
-                    if filled > 0:
-                        flush(layout, worker, filled, tiles, G)
                     if ti.static(layout.information):
                         keep_sums(layout, v, weight, mean, G, encoded, weights)
                     else:
@@ -340,37 +349,37 @@ def encode_points(
                 mean = ti.Vector([0.0] * channels)
                 ijk = row3(keys, v)
                 filled, weight = 0, 0.0
-                for o in range(27):
-                    b = neighbors[v, o]
-                    if b >= 0:
-                        for n in range(starts[b], starts[b + 1]):
-                            t = (row3(samples, n) - ijk - 0.5) * 0.5
-                            if ti.abs(t).max() <= 0.5:
-                                f = position_features(t, rank, anchors, projection, scale)
-                                for a in ti.static(range(rank)):
-                                    tiles[worker, a, filled] = f[a]
-                                for c in ti.static(range(channels)):
-                                    tiles[worker, size + c, filled] = targets[n, c]
-                                    mean[c] += targets[n, c]
-                                if ti.static(layout.centered):
-                                    tiles[worker, size + channels, filled] = 1.0
-                                filled += 1
-                                if ti.static(layout.derivatives):
-                                    for axis in range(3):
-                                        g = position_gradient(
-                                            t, axis, rank, anchors, projection, scale
-                                        )
-                                        for a in ti.static(range(rank)):
-                                            # d/dx = 1/2 d/dt
-                                            tiles[worker, a, filled] = 0.5 * g[a]
-                                        tiles[worker, size, filled] = targets[n, 1 + axis]
-                                        filled += 1
-                                weight += 1.0
-                                if filled > TILE - 4:
-                                    flush(layout, worker, filled, tiles, G)
-                                    filled = 0
-                if filled > 0:
-                    flush(layout, worker, filled, tiles, G)
+                for o in range(28):  # the last round has no neighbour, see `flush`
+                    last, begin, end = o == 27, 0, 1
+                    if not last:
+                        b = neighbors[v, o]
+                        end = 0
+                        if b >= 0:
+                            begin, end = starts[b], starts[b + 1]
+                    for n in range(begin, end):
+                        t = (row3(samples, n) - ijk - 0.5) * 0.5
+                        if not last and ti.abs(t).max() <= 0.5:
+                            f = position_features(t, rank, anchors, projection, scale)
+                            for a in ti.static(range(rank)):
+                                tiles[worker, a, filled] = f[a]
+                            for c in ti.static(range(channels)):
+                                tiles[worker, size + c, filled] = targets[n, c]
+                                mean[c] += targets[n, c]
+                            if ti.static(layout.centered):
+                                tiles[worker, size + channels, filled] = 1.0
+                            filled += 1
+                            if ti.static(layout.derivatives):
+                                for axis in range(3):
+                                    g = position_gradient(t, axis, rank, anchors, projection, scale)
+                                    for a in ti.static(range(rank)):
+                                        # d/dx = 1/2 d/dt
+                                        tiles[worker, a, filled] = 0.5 * g[a]
+                                    tiles[worker, size, filled] = targets[n, 1 + axis]
+                                    filled += 1
+                            weight += 1.0
+                        if filled > TILE - 4 or (last and filled > 0):
+                            flush(layout, worker, filled, tiles, G)
+                            filled = 0
                 if weight >= minimum:
                     if ti.static(layout.information):
                         keep_sums(layout, v, weight, mean, G, encoded, weights)
