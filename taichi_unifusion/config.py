@@ -16,11 +16,9 @@ import yaml
 
 from .errors import ConfigError, InputError, convert, did_you_mean, shortened
 from .files.strict_yaml import read_yaml
-from .maps.settings import FeatureSettings, PropertySettings, SurfaceSettings
+from .maps.settings import MAX_RESOLUTION, FeatureSettings, PropertySettings, SurfaceSettings
 from .preprocessing import PreprocessSettings
 from .tracking.base import TrackingSettings
-
-MAX_RESOLUTION = 32  # cells a voxel that `SurfaceMap.extract_mesh` takes
 
 
 @dataclass(frozen=True)
