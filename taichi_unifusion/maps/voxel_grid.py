@@ -7,6 +7,7 @@ slot and which block of which frame it is. What a voxel holds lies in pools, one
 
 from __future__ import annotations
 
+import gc
 import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -117,6 +118,8 @@ class VoxelGrid:
         the memory of a tree.
         """
         free = self.runtime.free_trees
+        if not free and self.runtime.trees >= runtime.MAX_TREES:
+            gc.collect()  # maps that only a cycle holds, as the traceback of a run that failed
         if free:
             tree = free.pop()
             tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
