@@ -6,12 +6,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import twin_calls
 from places import DATA, DEVICE
 
 import taichi_unifusion as uf
 
 
+twin_calls.record_twins()  # before a test imports them
+
+
 def pytest_configure(config: pytest.Config) -> None:
+    twin_calls.record_kernels()
+    config.pluginmanager.register(twin_calls.TwinCalls())
     config.addinivalue_line(
         "markers", "data: reads a real recording; skipped where it is not at hand"
     )
