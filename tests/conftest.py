@@ -11,7 +11,6 @@ from places import DATA, DEVICE
 
 import taichi_unifusion as uf
 
-
 twin_calls.record_twins()  # before a test imports them
 
 

@@ -148,6 +148,23 @@ def test_add_evidence_equals_its_twin():
     np.testing.assert_array_equal(added[others], old[others])
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_vote_support_equals_its_twin(sign):
+    """Voxels that the map does not hold get no vote."""
+    rng, grid = np.random.default_rng(5), VoxelGrid([WEIGHTS, MASKS])
+    keys = np.unique(rng.integers(-3, 3, (40, 3)), axis=0).astype(np.int32)
+    known = np.arange(len(keys)) % 4 > 0
+    slots = np.empty(len(keys), np.int32)
+    grid.claim(len(keys), keys, known.astype(np.float32), slots)
+    support = rng.uniform(size=(len(keys), 64)) < 0.4
+    evidence = np.zeros((grid.capacity, 64), np.int8)
+    kernels.vote_support(len(keys), keys, pack_masks(support), grid.index, sign, evidence)
+    votes = twin.vote_support({tuple(key): mask for key, mask in zip(keys, support, strict=True)})
+    for key, slot in zip(keys[known], slots[known], strict=True):
+        np.testing.assert_array_equal(evidence[slot], sign * votes[tuple(key)])
+    assert np.count_nonzero(evidence) == support[known].sum()
+
+
 def test_interpolate_evidence_equals_its_twin():
     rng, grid = np.random.default_rng(4), VoxelGrid([WEIGHTS, MASKS])
     keys = np.unique(rng.integers(-2, 2, (40, 3)), axis=0).astype(np.int32)

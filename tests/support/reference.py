@@ -476,7 +476,22 @@ def place_vertices(field, edge, resolution, corner, voxel_size):
     return (corner - 0.5 + (low + step * a / (a - b)) / resolution) * voxel_size
 
 
-def emit_triangles(case):
+def emit_triangles(cases, triangles_of, edge_table, place):
+    """(T, 9) corners of all triangles: those of each cell's case, on the cell's own edges.
+
+    `triangles_of(case)` gives edges of a cell, three a triangle; `place` where an edge's vertex is.
+    """
+    corners = []
+    for cell in np.argwhere(cases):
+        for triangle in triangles_of(cases[tuple(cell)]):
+            edges = [
+                (*(cell + edge_table[e, :3]).tolist(), int(edge_table[e, 3])) for e in triangle
+            ]
+            corners.append(np.concatenate([place[edge] for edge in edges]))
+    return np.array(corners)
+
+
+def face_segments(case):
     """Number of segments in which the surface of a case meets the cell's faces: half the crossings
     of the faces' borders.
     """
