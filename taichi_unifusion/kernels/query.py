@@ -120,29 +120,45 @@ def corner_support(
     # out:
     support: Masks2,  # (Q, 2) supported cells of the cube, numbered as those of a voxel
 ):
+    edge = ti.static(CELLS + 2)  # the cube's cells and one more on every side
     for q in range(keys.shape[0]):
-        around = ti.Vector([0] * BLOCK_CELLS)
+        seen = ti.Vector([0] * edge**3)
         for o in range(8):
             s = corner_slot(keys, q, o, index)
             if s >= 0:
                 # A voxel's cells 0..3 along an axis are cells -2..1 (upper voxel: 2..5) of the cube
                 # that starts at its centre.
-                base = ti.Vector([o // 4, o // 2 % 2, o % 2]) * CELLS - CELLS // 2
+                base = ti.Vector([o // 4, o // 2 % 2, o % 2]) * CELLS - CELLS // 2 + 1
                 for half in range(2):
                     mask = map_masks[s, half]
                     while mask != 0:
                         k = first_cell(mask)
                         mask ^= cell_bit(k)
                         at = base + cell_index(half * 32 + k)
-                        for i in range(ti.max(at[0] - 1, 0), ti.min(at[0] + 2, CELLS)):
-                            for j in range(ti.max(at[1] - 1, 0), ti.min(at[1] + 2, CELLS)):
-                                for m in range(ti.max(at[2] - 1, 0), ti.min(at[2] + 2, CELLS)):
-                                    itself = i == at[0] and j == at[1] and m == at[2]
-                                    around[(i * CELLS + j) * CELLS + m] += 27 if itself else 1
+                        if at.min() >= 0 and at.max() < edge:
+                            seen[(at[0] * edge + at[1]) * edge + at[2]] = 1
+        # sums over 3 x 3 x 3 cells, an axis at a time
+        along = ti.Vector([0] * (edge * edge * CELLS))
+        for row in range(edge * edge):
+            for z in ti.static(range(CELLS)):
+                at = row * edge + z
+                along[row * CELLS + z] = seen[at] + seen[at + 1] + seen[at + 2]
+        across = ti.Vector([0] * (edge * BLOCK_CELLS // CELLS))
+        for x in range(edge):
+            for y, z in ti.static(ti.ndrange(CELLS, CELLS)):
+                at = (x * edge + y) * CELLS + z
+                across[(x * CELLS + y) * CELLS + z] = (
+                    along[at] + along[at + CELLS] + along[at + 2 * CELLS]
+                )
         for half in range(2):
             reached = ti.u32(0)
             for k in range(32):
-                if around[half * 32 + k] >= ti.min(closing, 27):
+                cell = half * 32 + k
+                at = cell_index(cell) + 1
+                itself = seen[(at[0] * edge + at[1]) * edge + at[2]]
+                layer = ti.static(CELLS * CELLS)
+                around = across[cell] + across[cell + layer] + across[cell + 2 * layer]
+                if around + 26 * itself >= ti.min(closing, 27):
                     reached |= cell_bit(k)
             support[q, half] = reached
 
