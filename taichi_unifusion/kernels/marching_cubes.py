@@ -61,20 +61,22 @@ def classify_cells(
     edge_flags: Ints1,  # (256,) bit e: the case has a vertex on edge e
     # in and out:
     edges: Ints2,  # (Q, R^3) |= bit d: a vertex lies on the edge from the sample along axis d
+    cases: Bytes2,  # (Q, R^3) case of each cell; stays 0 where empty or unsupported
     # out:
-    cases: Bytes2,  # (Q, R^3) case of each cell, 0 where empty or unsupported
     triangles: Ints1,  # (Q,) triangles
 ):
     for q in range(sdf.shape[0]):
         total = 0
-        for c in range(sdf.shape[1]):
+        cells = sdf.shape[1] if support[q, 0] | support[q, 1] else 0
+        for c in range(cells):
             ijk = ti.Vector(
                 [c // (resolution * resolution), c // resolution % resolution, c % resolution]
             )
             case = 0
             if is_supported(support, q, ijk, resolution) == 1:
                 case = cell_case(q, ijk, resolution, upper, sdf)
-            cases[q, c] = ti.cast(case, ti.u8)
+            if case != 0:
+                cases[q, c] = ti.cast(case, ti.u8)
             total += triangle_counts[case]
             if triangle_counts[case] > 0:
                 for e in range(12):
@@ -107,30 +109,34 @@ def place_vertices(
     upper: Ints2,  # (Q, 8)
     sdf: Floats2,  # (Q, R^3)
     edges: Ints2,  # (Q, R^3)
-    starts: Ints1,  # (Q,) first vertex of each cube
+    starts: Ints1,  # (Q + 1,) first vertex of each cube, and V
     voxel_size: ti.f32,
+    # in and out:
+    first: Ints2,  # (Q, R^3) first vertex on the edges of a sample; as it was where there is none
     # out:
-    first: Ints2,  # (Q, R^3) first vertex on the edges of a sample
     vertices: Floats2,  # (V, 3) world [m]
 ):
     for q in range(sdf.shape[0]):
-        v = starts[q]
-        for s in range(sdf.shape[1]):
-            first[q, s] = v
-            ijk = ti.Vector(
-                [s // (resolution * resolution), s // resolution % resolution, s % resolution]
-            )
-            for d in range(3):
-                if edges[q, s] >> d & 1:
-                    along = ti.Vector([d == 0, d == 1, d == 2])
-                    cube, other = sample_at(q, ijk + ti.cast(along, ti.i32), resolution, upper)
-                    a, b = sdf[q, s], sdf[cube, other]
-                    x = (
-                        ti.cast(ijk, ti.f32) + ti.cast(along, ti.f32) * (a / (a - b))
-                    ) / resolution - 0.5
-                    for k in ti.static(range(3)):
-                        vertices[v, k] = (keys[q, k] + x[k]) * voxel_size
-                    v += 1
+        v, end = starts[q], starts[q + 1]
+        samples = sdf.shape[1] if v < end else 0
+        for s in range(samples):
+            crossed = edges[q, s]
+            if crossed != 0:
+                first[q, s] = v
+                ijk = ti.Vector(
+                    [s // (resolution * resolution), s // resolution % resolution, s % resolution]
+                )
+                for d in range(3):
+                    if crossed >> d & 1:
+                        along = ti.Vector([d == 0, d == 1, d == 2])
+                        cube, other = sample_at(q, ijk + ti.cast(along, ti.i32), resolution, upper)
+                        a, b = sdf[q, s], sdf[cube, other]
+                        x = (
+                            ti.cast(ijk, ti.f32) + ti.cast(along, ti.f32) * (a / (a - b))
+                        ) / resolution - 0.5
+                        for k in ti.static(range(3)):
+                            vertices[v, k] = (keys[q, k] + x[k]) * voxel_size
+                        v += 1
 
 
 @ti.kernel
@@ -141,7 +147,7 @@ def emit_triangles(
     cases: Bytes2,  # (Q, R^3)
     edges: Ints2,  # (Q, R^3)
     first: Ints2,  # (Q, R^3)
-    starts: Ints1,  # (Q,) first triangle of each cube
+    starts: Ints1,  # (Q + 1,) first triangle of each cube, and F
     triangle_counts: Ints1,  # (256,)
     triangle_edges: Ints2,  # (256, 15) cell edges, three a triangle
     corner_edges: Ints2,  # (12, 4)
@@ -149,13 +155,14 @@ def emit_triangles(
     faces: Ints2,  # (F, 3)
 ):
     for q in range(cases.shape[0]):
-        f = starts[q]
-        for c in range(cases.shape[1]):
+        f, end = starts[q], starts[q + 1]
+        cells = cases.shape[1] if f < end else 0
+        for c in range(cells):
             case = ti.cast(cases[q, c], ti.i32)
-            ijk = ti.Vector(
-                [c // (resolution * resolution), c // resolution % resolution, c % resolution]
-            )
             for t in range(triangle_counts[case]):
+                ijk = ti.Vector(
+                    [c // (resolution * resolution), c // resolution % resolution, c % resolution]
+                )
                 for k in range(3):
                     e = triangle_edges[case, 3 * t + k]
                     cube, s = sample_at(q, ijk + row3(corner_edges, e), resolution, upper)

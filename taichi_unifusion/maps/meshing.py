@@ -228,7 +228,7 @@ def _march(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Vertices (V, 3) world [m] and faces (F, 3) of the zero level."""
     counts, flags, table, edge_table = marching_cubes_tables()
-    cases, edges = np.empty(sdf.shape, np.uint8), np.zeros(sdf.shape, np.int32)
+    cases, edges = np.zeros(sdf.shape, np.uint8), np.zeros(sdf.shape, np.int32)
     triangles, on_edges = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
     kernels.classify_cells(
         resolution, upper, support, sdf, counts, edge_table, flags, edges, cases, triangles
@@ -236,11 +236,11 @@ def _march(
     kernels.count_vertices(edges, on_edges)
     vertex_starts, triangle_starts = _starts(on_edges), _starts(triangles)
     vertices, faces = (
-        np.empty((on_edges.sum(), 3), np.float32),
-        np.empty((triangles.sum(), 3), np.int32),
+        np.empty((vertex_starts[-1], 3), np.float32),
+        np.empty((triangle_starts[-1], 3), np.int32),
     )
     if len(faces):
-        first = np.empty(sdf.shape, np.int32)
+        first = np.zeros(sdf.shape, np.int32)
         kernels.place_vertices(
             resolution, keys, upper, sdf, edges, vertex_starts, voxel_size, first, vertices
         )
@@ -260,7 +260,8 @@ def _march(
 
 
 def _starts(counts: NDArray[np.int32]) -> NDArray[np.int32]:
-    return (np.cumsum(counts) - counts).astype(np.int32)
+    """Where each of counts (Q,) starts when they stand in a row, and where the last ends (Q + 1,)."""
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
 
 
 @lru_cache(maxsize=1)

@@ -127,7 +127,7 @@ def twin_cases(patchy) -> np.ndarray:
 def classified(patchy):
     keys, upper, samples, support, _ = patchy
     counts, flags, table, edge_table = meshing.marching_cubes_tables()
-    cases, edges = np.empty(samples.shape, np.uint8), np.zeros(samples.shape, np.int32)
+    cases, edges = np.zeros(samples.shape, np.uint8), np.zeros(samples.shape, np.int32)
     triangles = np.empty(len(keys), np.int32)
     kernels.classify_cells(
         R, upper, support, samples, counts, edge_table, flags, edges, cases, triangles
