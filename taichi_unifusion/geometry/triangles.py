@@ -22,13 +22,29 @@ def area_vectors(vertices: NDArray, faces: NDArray) -> NDArray[np.floating]:
     as the triangle's area [m^2], towards the side from which its corners (F, 3) run
     counter-clockwise.
     """
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    return np.cross(b - a, c - a) / 2
+    return np.stack(_cross_products(vertices, faces), axis=1) / 2
 
 
 def areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
     """Areas (F,) [m^2]."""
-    return np.linalg.norm(area_vectors(np.asarray(vertices, np.float64), faces), axis=1)
+    x, y, z = _cross_products(np.asarray(vertices, np.float64), faces)
+    return np.sqrt(x * x + y * y + z * z) / 2
+
+
+def _cross_products(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """x, y and z, (F,) each, of the cross product of two edges of every triangle.
+
+    Coordinate by coordinate: several times faster than `np.cross` of rows.
+    """
+    (ux, vx), (uy, vy), (uz, vz) = (_edges(vertices[:, d], faces) for d in range(3))
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+def _edges(coordinate: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
+    """From the first corner of every triangle to the two others, along one coordinate (V,)."""
+    coordinate = np.ascontiguousarray(coordinate)
+    a, b, c = (coordinate.take(faces[:, k]) for k in range(3))
+    return b - a, c - a
 
 
 def vertex_areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from .voxel_grid import VoxelGrid
 
 STEPS = np.array(list(product((0, 1), repeat=3)))  # (8, 3) corners of a cube, x slowest
+# a lattice point as one integer, of the same order: its three indices and their offset
+CODE_BITS, CODE_OFFSET = 21, 1 << 20
+CODE_STEPS = np.array([1 << 2 * CODE_BITS, 1 << CODE_BITS, 1])  # of one point along x, y and z
 SNAP = 1e-4  # of an edge: a cut this near to a vertex goes through it
 NORMAL_UNIT = float(1 << 18)  # fixed-point one of summed normals, in squared grid spacings
 
@@ -45,12 +48,12 @@ def extract_mesh(
     A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map
     holds evidence, the mesh ends on the line where evidence falls below `min_evidence`.
     """
-    keys, support = _cubes(grid, support_closing)
-    if not len(keys):
+    codes, support = _cubes(grid, support_closing)
+    if not len(codes):
         return Mesh(
             np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32)
         )
-    upper = _upper_cubes(keys)
+    keys, upper = _keys(codes), _upper_cubes(codes)
     sdf = np.empty((len(keys), resolution**3), np.float32)
     query.sdf_grid(
         encoding.settings.rank,
@@ -81,17 +84,17 @@ def cut_mesh(
     on the border are cut.
     """
     inside = values >= 0
-    corners = inside[faces].sum(axis=1)
+    a, b, c = (inside.view(np.uint8).take(faces[:, k]) for k in range(3))
+    corners = a + b + c  # that stay
     if (corners == 3).all():
         return vertices, faces
-    odd_in = _odd_first(faces[corners == 1], inside)  # a corner stays: the first
-    odd_out = _odd_first(faces[corners == 2], ~inside)  # a corner goes: the first
-    edges = np.concatenate(
-        [odd_in[:, [0, 1]], odd_in[:, [0, 2]], odd_out[:, [0, 1]], odd_out[:, [0, 2]]]
-    )
-    low, high = np.sort(edges, axis=1).astype(np.int64).T
+    odd_in = _odd_first(np.compress(corners == 1, faces, axis=0), inside)  # the first stays
+    odd_out = _odd_first(np.compress(corners == 2, faces, axis=0), ~inside)  # the first goes
+    first = np.concatenate([odd_in[:, 0], odd_in[:, 0], odd_out[:, 0], odd_out[:, 0]])
+    other = np.concatenate([odd_in[:, 1], odd_in[:, 2], odd_out[:, 1], odd_out[:, 2]])
+    low, high = np.minimum(first, other), np.maximum(first, other)
     # an edge is cut once, also between two triangles
-    cut, at = np.unique(low * len(vertices) + high, return_inverse=True)
+    cut, at = np.unique(low * np.int64(len(vertices)) + high, return_inverse=True)
     a, b = cut // len(vertices), cut % len(vertices)
     share = values[a] / (values[a] - values[b])
     on_edges = vertices[a] + share[:, None] * (vertices[b] - vertices[a])
@@ -101,18 +104,20 @@ def cut_mesh(
     i, j, p, q = np.split(
         number[at.reshape(-1)], np.cumsum([len(odd_in), len(odd_in), len(odd_out)])
     )
-    rest = np.concatenate(
+    pieces = np.concatenate(
         [
-            faces[corners == 3],
             np.stack([odd_in[:, 0], i, j], axis=1),
             np.stack([p, odd_out[:, 1], odd_out[:, 2]], axis=1),
             np.stack([p, odd_out[:, 2], q], axis=1),
         ]
     )
     # what a cut through a corner makes of a triangle
-    rest = rest[(rest != np.roll(rest, 1, axis=1)).all(axis=1)]
-    together = np.concatenate([vertices, on_edges]).astype(np.float32, copy=False)
-    return _without_unused(together, rest)
+    pieces = pieces[(pieces != pieces[:, [2, 0, 1]]).all(axis=1)]
+    whole = np.compress(corners == 3, faces, axis=0)
+    return _without_unused(
+        np.concatenate([vertices, on_edges]).astype(np.float32, copy=False),
+        np.concatenate([whole, pieces.astype(np.int32)]),
+    )
 
 
 def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -124,11 +129,16 @@ def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.i
 
 
 def _without_unused(
-    vertices: NDArray[np.float32], faces: NDArray
+    vertices: NDArray[np.float32], faces: NDArray[np.int32]
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    return vertices[used], (np.cumsum(used) - 1).astype(np.int32)[faces]
+    used[faces.reshape(-1)] = True
+    return np.compress(used, vertices, axis=0), _ranks(used).take(faces)
+
+
+def _ranks(chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """The number (N,) that each of the chosen (N,) has among them."""
+    return np.cumsum(chosen, dtype=np.int32) - 1
 
 
 def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
@@ -139,12 +149,12 @@ def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
         return mesh
     part, a = connected_parts(mesh.faces, len(mesh.vertices)), mesh.faces[:, 0]
     kept = np.bincount(part[a], areas(mesh.vertices, mesh.faces))[part] >= min_area  # (V,)
-    renumber = (np.cumsum(kept) - 1).astype(np.int32)
+    faces = np.compress(kept[a], mesh.faces, axis=0)
     return Mesh(
-        mesh.vertices[kept],
-        renumber[mesh.faces[kept[a]]],
-        None if mesh.normals is None else mesh.normals[kept],
-        {name: values[kept] for name, values in mesh.attributes.items()},
+        np.compress(kept, mesh.vertices, axis=0),
+        _ranks(kept).take(faces),
+        None if mesh.normals is None else np.compress(kept, mesh.normals, axis=0),
+        {name: np.compress(kept, values, axis=0) for name, values in mesh.attributes.items()},
     )
 
 
@@ -158,47 +168,57 @@ def connected_parts(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32
     return part
 
 
-def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int32], NDArray[np.uint32]]:
-    """Sorted keys (Q, 3) of the cubes that hold surface or close one that does, and their support
+def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
+    """Sorted codes (Q,) of the cubes that hold surface or close one that does, and their support
     masks (Q, 2).
     """
-    keys = unique_rows((grid.voxel_keys()[:, None] + STEPS).reshape(-1, 3))
-    support = np.empty((len(keys), 2), np.uint32)
-    if len(keys):
-        query.corner_support(keys, grid.index, grid["masks"], support_closing, support)
+    codes = _with_upper(np.sort(_codes(grid.voxel_keys())))
+    support = np.empty((len(codes), 2), np.uint32)
+    if len(codes):
+        query.corner_support(_keys(codes), grid.index, grid["masks"], support_closing, support)
     with_surface = support.any(axis=1)
-    keys, support = keys[with_surface], support[with_surface]
+    codes, support = codes[with_surface], support[with_surface]
     # the last cells of a cube need the samples above
-    closed = unique_rows((keys[:, None] + STEPS).reshape(-1, 3))
+    closed = _with_upper(codes)
     closed_support = np.zeros((len(closed), 2), np.uint32)
-    closed_support[np.searchsorted(_codes(closed), _codes(keys))] = support
+    closed_support[np.searchsorted(closed, codes)] = support
     return closed, closed_support
 
 
-def unique_rows(rows: NDArray) -> NDArray[np.int32]:
-    """Distinct integer triples in lexicographic order."""
-    codes = np.unique(_codes(rows))
-    return np.stack([(codes >> s & 0x1FFFFF) - (1 << 20) for s in (42, 21, 0)], axis=1).astype(
-        np.int32
-    )
+def _codes(keys: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Lattice points (N, 3) as single integers (N,) of the same order."""
+    return (keys.astype(np.int64) + CODE_OFFSET) @ CODE_STEPS
 
 
-def _codes(rows: NDArray) -> NDArray[np.int64]:
-    """Triples as single integers of the same order."""
-    rows = rows.astype(np.int64) + (1 << 20)
-    return rows[:, 0] << 42 | rows[:, 1] << 21 | rows[:, 2]
+def _keys(codes: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Lattice points (N, 3) of codes (N,)."""
+    keys = np.empty((len(codes), 3), np.int32)
+    for d in range(3):
+        keys[:, d] = (codes >> (2 - d) * CODE_BITS & (1 << CODE_BITS) - 1) - CODE_OFFSET
+    return keys
 
 
-def _upper_cubes(keys: NDArray[np.int32]) -> NDArray[np.int32]:
-    """(Q, 8) row of the cube at each of STEPS from every cube, -1 where there is none; `keys` are
-    sorted.
+def _with_upper(codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sorted codes of lattice points, and of all that lie at one of STEPS from one of them."""
+    for step in CODE_STEPS[::-1]:
+        both = np.concatenate([codes, codes + step])
+        both.sort(kind="stable")  # merges what is in order
+        codes = both[np.diff(both, prepend=-1) != 0]
+    return codes
+
+
+def _upper_cubes(codes: NDArray[np.int64]) -> NDArray[np.int32]:
+    """(Q, 8) row of the cube at each of STEPS from every cube, -1 where there is none; `codes` (Q,)
+    are sorted.
     """
-    codes = _codes(keys)
-    upper = np.empty((len(keys), 8), np.int32)
-    for o, step in enumerate(STEPS):
-        wanted = _codes(keys + step)
-        at = np.minimum(np.searchsorted(codes, wanted), len(codes) - 1)
-        upper[:, o] = np.where(codes[at] == wanted, at, -1)
+    upper, ended = np.empty((len(codes), 8), np.int32), np.append(codes, -1)
+    for o in range(0, 8, 2):
+        wanted = codes + STEPS[o] @ CODE_STEPS
+        at = np.searchsorted(codes, wanted)
+        found = ended[at] == wanted
+        upper[:, o] = np.where(found, at, -1)
+        at += found  # the next along z follows it
+        upper[:, o + 1] = np.where(ended[at] == wanted + 1, at, -1)
     return upper
 
 

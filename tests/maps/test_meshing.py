@@ -31,7 +31,11 @@ def cubes_of(field: np.ndarray, first=(0, 0, 0), keep=None):
     places = np.array([q for q in product(range(n), repeat=3) if keep is None or keep[q]])
     samples = [field[tuple(slice(R * i, R * i + R) for i in q)].reshape(-1) for q in places]
     keys = (places + first).astype(np.int32)
-    return keys, meshing._upper_cubes(keys), np.ascontiguousarray(samples, np.float32)
+    return (
+        keys,
+        meshing._upper_cubes(meshing._codes(keys)),
+        np.ascontiguousarray(samples, np.float32),
+    )
 
 
 def march(field: np.ndarray, first=(0, 0, 0)):
@@ -232,14 +236,29 @@ def test_smooth_fields_agree_with_scikit_image(first):
     )
 
 
-def test_upper_cubes_are_found_by_key():
-    keys = meshing.unique_rows(np.random.default_rng(0).integers(-3, 3, (60, 3)) + (8000, -8000, 0))
+@pytest.fixture(scope="module")
+def places() -> set[tuple[int, ...]]:
+    rng = np.random.default_rng(0)
+    return set(map(tuple, (rng.integers(-3, 3, (60, 3)) + (8000, -8000, 0)).tolist()))
+
+
+def test_upper_cubes_are_found_by_code(places):
+    keys = np.array(sorted(places), np.int32)
     rows = {key: n for n, key in enumerate(map(tuple, keys.tolist()))}
-    assert sorted(rows) == list(rows)
     wanted = [
         [rows.get(tuple((key + step).tolist()), -1) for step in meshing.STEPS] for key in keys
     ]
-    np.testing.assert_array_equal(meshing._upper_cubes(keys), wanted)
+    np.testing.assert_array_equal(meshing._upper_cubes(meshing._codes(keys)), wanted)
+
+
+def test_codes_are_in_the_order_of_keys_and_gain_all_upper_neighbours(places):
+    keys = np.array(sorted(places), np.int32)
+    codes = meshing._codes(keys)
+    assert (np.diff(codes) > 0).all()
+    np.testing.assert_array_equal(meshing._keys(codes), keys)
+    wanted = {tuple((np.array(key) + step).tolist()) for key in places for step in meshing.STEPS}
+    np.testing.assert_array_equal(meshing._keys(meshing._with_upper(codes)), sorted(wanted))
+    assert not len(meshing._with_upper(codes[:0]))
 
 
 def test_an_empty_map_has_an_empty_mesh():
