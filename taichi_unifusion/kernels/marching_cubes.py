@@ -5,7 +5,7 @@ Cline).
 import taichi as ti
 
 from .arrays import Bytes2, Floats2, Ints1, Ints2, Masks2, row3
-from .cells import CELLS, has_cell
+from .cells import CELLS
 from .query import UNKNOWN
 
 
@@ -21,32 +21,60 @@ def sample_at(q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.templ
 
 
 @ti.func
-def cell_case(
-    q: ti.i32, ijk: ti.template(), resolution: ti.i32, upper: ti.template(), sdf: ti.template()
-) -> ti.i32:
-    """Bit o set where corner o (x slowest) lies behind the surface; 0, no surface, where a corner
-    is unknown.
+def corners_behind(k: ti.i32, cubes: ti.template(), samples: ti.template(), sdf: ti.template()):
+    """Bit 2 m set where sample `samples[m] + k` of cube `cubes[m]`, for m = 0..3, lies behind the
+    surface; -1 where one of the four is unknown.
     """
-    case, known = 0, True
-    for o in range(8):
-        cube, s = sample_at(q, ijk + ti.Vector([o // 4, o // 2 % 2, o % 2]), resolution, upper)
+    behind, known = 0, True
+    for m in ti.static(range(4)):
         value = UNKNOWN
-        if cube >= 0:
-            value = sdf[cube, s]
+        if cubes[m] >= 0:
+            value = sdf[cubes[m], samples[m] + k]
         if value >= 0.5 * UNKNOWN:
             known = False
         if value < 0:
-            case |= 1 << o
-    return case if known else 0
+            behind |= 1 << 2 * m
+    return behind if known else -1
 
 
 @ti.func
-def is_supported(
-    support: ti.template(), q: ti.i32, ijk: ti.template(), resolution: ti.i32
+def column_support(
+    support: ti.template(), q: ti.i32, i: ti.i32, j: ti.i32, resolution: ti.i32
 ) -> ti.i32:
-    """Whether the support cell that contains the middle of a mesh cell is set."""
-    cell = (2 * ijk + 1) * CELLS // (2 * resolution)
-    return has_cell(support, q, (cell[0] * CELLS + cell[1]) * CELLS + cell[2])
+    """The four support cells, lowest first, that hold the middles of the mesh cells (i, j, k) of
+    cube q.
+    """
+    x, y = support_cell(i, resolution), support_cell(j, resolution)
+    lowest = (x * CELLS + y) * CELLS
+    word = support[q, lowest >> 5]
+    return ti.cast(word >> ti.cast(32 - CELLS - (lowest & 31), ti.u32), ti.i32) & (1 << CELLS) - 1
+
+
+@ti.func
+def support_cell(i: ti.i32, resolution: ti.i32) -> ti.i32:
+    """The support cell, along an axis, that contains the middle of mesh cell i."""
+    return (2 * i + 1) * CELLS // (2 * resolution)
+
+
+@ti.func
+def mark_edges(
+    # in:
+    flags: ti.i32,
+    q: ti.i32,
+    ijk: ti.template(),
+    resolution: ti.i32,
+    upper: ti.template(),
+    corner_edges: ti.template(),
+    # in and out:
+    edges: ti.template(),
+):
+    """Set the bit of every edge of cell ijk that `flags` names."""
+    for e in range(12):
+        if flags >> e & 1:
+            cube, s = sample_at(q, ijk + row3(corner_edges, e), resolution, upper)
+            bit = 1 << corner_edges[e, 3]
+            if edges[cube, s] & bit == 0:  # three of four times another cell was here before
+                ti.atomic_or(edges[cube, s], bit)
 
 
 @ti.kernel
@@ -67,22 +95,37 @@ def classify_cells(
 ):
     for q in range(sdf.shape[0]):
         total = 0
-        cells = sdf.shape[1] if support[q, 0] | support[q, 1] else 0
-        for c in range(cells):
-            ijk = ti.Vector(
-                [c // (resolution * resolution), c // resolution % resolution, c % resolution]
-            )
-            case = 0
-            if is_supported(support, q, ijk, resolution) == 1:
-                case = cell_case(q, ijk, resolution, upper, sdf)
-            if case != 0:
-                cases[q, c] = ti.cast(case, ti.u8)
-            total += triangle_counts[case]
-            if triangle_counts[case] > 0:
-                for e in range(12):
-                    if edge_flags[case] >> e & 1:
-                        cube, s = sample_at(q, ijk + row3(corner_edges, e), resolution, upper)
-                        ti.atomic_or(edges[cube, s], 1 << corner_edges[e, 3])
+        columns = resolution * resolution if support[q, 0] | support[q, 1] else 0
+        for column in range(columns):
+            ijk = ti.Vector([column // resolution, column % resolution, 0])
+            supported = column_support(support, q, ijk[0], ijk[1], resolution)
+            layers = resolution if supported != 0 else 0
+            # the columns of samples at the cell's four lower corners, and the cubes above them
+            cubes, samples, above = ti.Vector([0] * 4), ti.Vector([0] * 4), ti.Vector([0] * 4)
+            for m in ti.static(range(4)):
+                corner = ijk + ti.Vector([m // 2, m % 2, 0])
+                cubes[m], samples[m] = sample_at(q, corner, resolution, upper)
+                above[m], _ = sample_at(
+                    q, corner + ti.Vector([0, 0, resolution]), resolution, upper
+                )
+            low = corners_behind(0, cubes, samples, sdf)
+            for k in range(layers):
+                ijk[2] = k
+                high = 0
+                if k + 1 < resolution:
+                    high = corners_behind(k + 1, cubes, samples, sdf)
+                else:
+                    high = corners_behind(0, above, samples, sdf)
+                case = 0  # bit o is set where corner o (x slowest) lies behind the surface
+                cell = CELLS - 1 - support_cell(k, resolution)
+                if low >= 0 and high >= 0 and supported >> cell & 1:
+                    case = low | high << 1
+                low = high
+                if case != 0:
+                    cases[q, column * resolution + k] = ti.cast(case, ti.u8)
+                total += triangle_counts[case]
+                if triangle_counts[case] > 0:
+                    mark_edges(edge_flags[case], q, ijk, resolution, upper, corner_edges, edges)
         triangles[q] = total
 
 
