@@ -6,17 +6,21 @@ the runtime that they were made under (`current()`) and refuse to go on under an
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import platform
+import subprocess
 import sys
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
 from functools import cache
+from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 from .errors import CapacityError, MissingDependency, RuntimeStateError, check_choice
 
@@ -27,7 +31,8 @@ DeviceArray = Any
 
 DEVICES = ("auto", "cuda", "cpu")
 STALE_LOCK = 60  # [s] Taichi locks its cache of compiled kernels for a second or two
-MAX_TREES = 12  # each reserves some 80 MB of a pool that fails silently somewhat above 1.6 GB
+MAX_TREES = 12
+PROBE_SECONDS = 20.0  # a driver that has not answered by then is taken for broken
 
 
 def grown(room: int, needed: int) -> int:
@@ -86,6 +91,8 @@ class Runtime:
         self.arena = Arena()
         self.trees = 0  # index trees made
         self.free_trees: list[Any] = []  # those of maps that are gone: Taichi cannot free them
+        self.grids: WeakSet[Any] = WeakSet()  # of the maps that live
+        self.leaves: dict[Any, int] = {}  # index tree -> leaves that it ever had, at most
 
     def count_tree(self) -> None:
         """Note that one more index tree is made; raises CapacityError before there are more than
@@ -123,7 +130,7 @@ def init(
         raise RuntimeStateError(
             f"device: Taichi already runs on {_runtime.device}; start a new process to use {device}"
         )
-    ti = _import_taichi()
+    ti = import_taichi()
     if not debug:
         _quicken_tracing()
     _free_kernel_cache(
@@ -139,14 +146,21 @@ def init(
     }
     if threads:
         options["cpu_max_num_threads"] = threads
-    wanted = ti.cpu if device == "cpu" else ti.cuda  # never ti.gpu: Vulkan has no pointer SNodes
+    trouble = "" if device == "cpu" else _cuda_trouble()
+    if device == "cuda" and trouble:
+        raise RuntimeStateError(f"device: CUDA was asked for but {trouble}; or use device 'cpu'")
+    # never ti.gpu: Vulkan has no pointer SNodes
+    wanted = ti.cpu if device == "cpu" or trouble else ti.cuda
     with redirect_stdout(StringIO()):  # what we run on is said by us, where people look for it
         ti.init(arch=wanted, device_memory_GB=device_memory_gb, **options)
     found = "cuda" if ti.lang.impl.current_cfg().arch == ti.cuda else "cpu"
     if device == "cuda" and found != "cuda":
         raise RuntimeStateError(
-            "device: CUDA was asked for but Taichi finds none; use device 'cpu' or check the NVIDIA driver"
+            "device: CUDA was asked for but Taichi could not start it; check the NVIDIA driver, or "
+            "use device 'cpu'"
         )
+    if trouble and trouble != NO_DRIVER:  # there is a GPU, which somebody might want to use
+        logger.warning("CUDA is not used: %s", trouble)
     _runtime = Runtime(found, _describe(found, threads))
     _say(f"Taichi {'.'.join(map(str, ti.__version__))} on {_runtime.description}")
     return _runtime
@@ -189,15 +203,15 @@ def _quicken_tracing() -> None:
     For every expression of a kernel it wraps the source line to 80 columns, for a message in case
     of an error; and it looks up the source of every function anew wherever a kernel calls it.
     """
-    from taichi.lang import kernel_impl
-    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+    ti = import_taichi()
+    kernel_impl, context = ti.lang.kernel_impl, ti.lang.ast.ast_transformer_utils
 
     def get_pos_info(self: Any, node: Any) -> str:
         line = self.src[node.lineno - 1].rstrip()
         number = node.lineno + self.lineno_offset
         return f'File "{self.file}", line {number}, in {self.func.func.__name__}:\n{line}\n'
 
-    ASTTransformerContext.get_pos_info = get_pos_info
+    context.ASTTransformerContext.get_pos_info = get_pos_info
     for name in ("getsourcefile", "getsourcelines"):
         setattr(kernel_impl, name, cache(getattr(kernel_impl, name)))
 
@@ -209,17 +223,62 @@ def _say(sentence: str) -> None:
         print(sentence, file=sys.stderr)
 
 
-def _import_taichi() -> Any:
+def import_taichi() -> Any:
+    """Taichi, or the package that takes its place where UNIFUSION_TAICHI names one, such as the fork
+    `taichi_forge`. Every file of kernels is imported after this.
+    """
     os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+    name = os.environ.get("UNIFUSION_TAICHI") or "taichi"
     try:
-        import taichi
+        taichi = import_module(name)
     except (ImportError, OSError) as error:
         if "libX11" in str(error):
             raise MissingDependency(
                 "Taichi needs the system library libX11; run: apt-get install -y libx11-6"
             ) from error
+        if name != "taichi" and isinstance(error, ModuleNotFoundError):
+            raise MissingDependency(
+                f"UNIFUSION_TAICHI={name}: there is no such package; install it or unset the variable"
+            ) from error
         raise
+    if name != "taichi":
+        sys.modules["taichi"] = taichi
     return taichi
+
+
+NO_DRIVER = "there is no NVIDIA driver (libcuda.so.1); install one"
+# Starts the driver and counts its devices, as Taichi would.
+_PROBE = """
+import ctypes
+driver, count = ctypes.CDLL("libcuda.so.1"), ctypes.c_int()
+raise SystemExit(driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)) or not count.value)
+"""
+
+
+def _cuda_trouble() -> str:
+    """Why CUDA cannot be used, as a clause that says what to do; "" where nothing speaks against it.
+
+    A broken driver can hang whoever starts it, so a process of its own tries it first.
+    """
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return NO_DRIVER
+    try:
+        ctypes.CDLL("libcuda.so")  # the name that Taichi opens
+    except OSError:
+        return "Taichi needs libcuda.so; make a link of that name to libcuda.so.1"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE], timeout=PROBE_SECONDS, capture_output=True, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return (
+            f"the NVIDIA driver did not answer in {PROBE_SECONDS:.0f} s; check it with nvidia-smi"
+        )
+    if done.returncode:
+        return "the NVIDIA driver finds no device that works; check it with nvidia-smi"
+    return ""
 
 
 def _describe(device: str, threads: int | None) -> str:

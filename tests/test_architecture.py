@@ -15,7 +15,8 @@ LOOSE_FILES = {"__init__", "types", "errors", "runtime", "config", "preprocessin
 # From the ground up. A room imports from lower floors alone, also where it imports within functions.
 FLOORS = [
     {"errors"},
-    {"runtime", "geometry", "kernels"},
+    {"runtime", "geometry"},
+    {"kernels"},
     {"types"},
     {"files"},
     {"preprocessing", "maps", "rendering"},

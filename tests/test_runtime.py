@@ -27,6 +27,46 @@ def test_only_an_old_lock_is_taken_from_the_cache_of_kernels(age, stays, tmp_pat
     assert lock.exists() == stays
 
 
+@pytest.mark.parametrize(
+    ("libraries", "answer", "said"),
+    [
+        ((), None, "no NVIDIA driver"),
+        (("libcuda.so.1",), None, "make a link of that name to libcuda.so.1"),
+        (("libcuda.so.1", "libcuda.so"), 1, "finds no device that works"),
+        (("libcuda.so.1", "libcuda.so"), "never", "did not answer in 20 s"),
+        (("libcuda.so.1", "libcuda.so"), 0, ""),
+    ],
+)
+def test_a_driver_that_cannot_be_used_is_found_out_without_starting_it(
+    libraries, answer, said, monkeypatch
+):
+    def load(name):
+        if name not in libraries:
+            raise OSError(name)
+
+    def run(command, timeout, **_):
+        if answer == "never":
+            raise subprocess.TimeoutExpired(command, timeout)
+        return subprocess.CompletedProcess(command, answer)
+
+    monkeypatch.setattr(runtime.ctypes, "CDLL", load)
+    monkeypatch.setattr(runtime.subprocess, "run", run)
+    found = runtime._cuda_trouble()
+    assert said in found and bool(found) == bool(said)
+
+
+def test_another_taichi_that_is_not_there_is_named(tmp_path):
+    code = "import taichi_unifusion as uf; uf.init('cpu')"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"UNIFUSION_TAICHI": "taichi_of_nobody"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "UNIFUSION_TAICHI=taichi_of_nobody: there is no such package" in done.stderr
+
+
 def test_a_cache_that_is_not_there_is_no_error(tmp_path):
     runtime._free_kernel_cache(str(tmp_path / "none"))
 

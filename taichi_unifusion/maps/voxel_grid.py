@@ -24,12 +24,12 @@ from ..kernels.pools import gather_rows
 from ..runtime import DeviceArray, grown
 from .pool import Pool, VoxelField
 
-# bytes of sparse nodes: Taichi's CPU pool fails silently somewhat above 1.6 GB
-SPARSE_LIMIT = 1 << 30
+# Bytes of sparse nodes, of one map and of all that the process ever had: Taichi's pool on the CPU
+# fails silently somewhat above 1.6 GB, and gives nothing back.
+SPARSE_LIMIT, SPARSE_POOL = 1 << 30, 1_450_000_000
+BYTES_PER_TREE = 80_000_000  # what an empty index tree takes of the pool
 # a 4^3 leaf with three i32 fields and its share of the nodes above it
 BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16
-# recount the tree's leaves after at least this many touches (0.2 GB can grow unnoticed)
-CHECK_EVERY = 100_000
 FIRST_CAPACITY = 4096
 
 KEYS = VoxelField("keys", np.dtype(np.int32), (3,))
@@ -97,6 +97,8 @@ class VoxelGrid:
         self.index = self._borrow_tree()
         self._pools = {field.name: Pool(field, FIRST_CAPACITY) for field in (KEYS, *self.fields)}
         self._leaves, self._touched = 0, 0
+        self._inherited = self.runtime.leaves.get(self.index, 0)
+        self.runtime.grids.add(self)
 
     def __getitem__(self, name: str) -> DeviceArray:
         """The array of a pool, (S, ...) by slot; another one after the grid has grown."""
@@ -115,7 +117,7 @@ class VoxelGrid:
 
     def _borrow_tree(self) -> kernels.Index:
         """An empty index tree: one that a map no longer uses, else a new one. Taichi never frees
-        the memory of a tree.
+        the memory of a tree, and on CUDA one that was emptied is not safe to fill again.
         """
         free = self.runtime.free_trees
         if not free and self.runtime.trees >= runtime.MAX_TREES:
@@ -126,7 +128,8 @@ class VoxelGrid:
         else:
             self.runtime.count_tree()
             tree = _build_tree()
-        weakref.finalize(self, free.append, tree)
+        if self.runtime.device == "cpu":
+            weakref.finalize(self, free.append, tree)
         return tree
 
     def next_frame(self) -> int:
@@ -136,19 +139,43 @@ class VoxelGrid:
         return self.frame
 
     def note_touched(self, voxels: int) -> None:
-        """Count the index's leaves now and then: touching a voxel takes sparse memory also if it is
-        never encoded.
+        """Note that voxels were touched, which takes sparse memory also if none is encoded.
 
-        Raises CapacityError before that memory becomes unsafe.
+        Raises CapacityError before the memory of this map, or of all maps, becomes unsafe.
         """
         self._touched += voxels
-        if self._touched > max(CHECK_EVERY, self._leaves):
-            self._leaves, self._touched = int(kernels.count_leaves(self.index)), 0
-        if self._leaves * BYTES_PER_LEAF > SPARSE_LIMIT:
+        self._note_leaves()
+        if self._alone_too_large() or self._together_too_large():
+            for grid in self.runtime.grids:  # touched voxels may have been there before: count
+                grid.recount()
+        if self._alone_too_large():
             raise CapacityError(
-                f"the map holds {self.count:,} voxels and its index would pass 1 GB, where Taichi "
-                "is no longer safe: use larger voxels or save the map and start a new one"
+                f"the map holds {self.count:,} voxels and its index would pass "
+                f"{SPARSE_LIMIT / 1e9:.1f} GB, where Taichi is no longer safe: use larger voxels or "
+                "save the map and start a new one"
             )
+        if self._together_too_large():
+            raise CapacityError(
+                f"the indices of all maps of this process, {len(self.runtime.grids)} now and those "
+                f"before, would pass {SPARSE_POOL / 1e9:.2f} GB, where Taichi is no longer safe: use "
+                "larger voxels or fewer maps, or save the maps and go on in a new process"
+            )
+
+    def recount(self) -> None:
+        """Count the leaves of the index tree."""
+        self._leaves, self._touched = int(kernels.count_leaves(self.index)), 0
+        self._note_leaves()
+
+    def _note_leaves(self) -> None:
+        """What the tree has now, at most; memory that it had for an earlier map stays with it."""
+        self.runtime.leaves[self.index] = max(self._inherited, self._leaves + self._touched)
+
+    def _alone_too_large(self) -> bool:
+        return (self._leaves + self._touched) * BYTES_PER_LEAF > SPARSE_LIMIT
+
+    def _together_too_large(self) -> bool:
+        leaves = sum(self.runtime.leaves.values())
+        return self.runtime.trees * BYTES_PER_TREE + leaves * BYTES_PER_LEAF > SPARSE_POOL
 
     def reserve(self, extra: int) -> None:
         """Make room for `extra` more voxels; raises CapacityError before sparse memory becomes

@@ -166,10 +166,34 @@ def test_an_index_that_would_pass_safe_memory_is_refused(monkeypatch):
     ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
     assert grid.claim(len(keys), keys, ones, slots) == len(keys)
     monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * (len(keys) - 1))
-    monkeypatch.setattr(voxel_grid, "CHECK_EVERY", 0)
     with pytest.raises(CapacityError, match="3,375 voxels .* larger voxels or save"):
         grid.claim(len(keys), keys + 400, ones, slots)
     assert grid.count == len(keys)
+
+
+def test_the_indices_of_all_maps_count_together(monkeypatch):
+    """Each map alone is within its limit; what is touched again and again counts once."""
+    gc.collect()
+    grids, rng = [a_grid() for _ in range(3)], np.random.default_rng(8)
+    live = runtime.current()
+    before = live.trees * voxel_grid.BYTES_PER_TREE
+    before += sum(live.leaves.values()) * voxel_grid.BYTES_PER_LEAF
+    points = [rng.uniform(-200, 200, (1000, 3)).astype(np.float32) for _ in range(60)]
+
+    def integrate(grid, part):
+        keys = touch(grid, part)
+        ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
+        grid.claim(len(keys), keys, ones, slots)
+
+    monkeypatch.setattr(voxel_grid, "SPARSE_POOL", before + 9000 * voxel_grid.BYTES_PER_LEAF)
+    for _ in range(20):
+        for grid in grids:
+            integrate(grid, points[0])
+    with pytest.raises(CapacityError, match="all maps of this process, .* new process"):
+        for part in points:
+            for grid in grids:
+                integrate(grid, part)
+    assert min(map(len, grids)) > 1000
 
 
 def test_lone_points_that_make_no_voxel_also_count_against_safe_memory(monkeypatch):
@@ -177,7 +201,6 @@ def test_lone_points_that_make_no_voxel_also_count_against_safe_memory(monkeypat
     grid = a_grid()
     rng = np.random.default_rng(8)
     monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * 5000)
-    monkeypatch.setattr(voxel_grid, "CHECK_EVERY", 2000)
     with pytest.raises(CapacityError, match="larger voxels or save"):
         for _ in range(20):
             keys = touch(grid, rng.uniform(-200, 200, (1000, 3)).astype(np.float32))

@@ -251,7 +251,6 @@ def test_a_map_that_may_not_grow_is_refused_before_it_changes(kind, fused, monke
     fused.save(tmp_path / "map")
     target = load_map(tmp_path / "map")
     monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", 1)
-    monkeypatch.setattr(voxel_grid, "CHECK_EVERY", 0)  # so that the leaves are counted now
     with pytest.raises(CapacityError, match="save the map"):
         target.integrate(moved(frames()[0], (5, 5, 5)))
     assert content(target) == content(fused)
