@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .datasets import open_dataset
     from .errors import UniFusionError
     from .maps import PropertyMap, SurfaceMap, load_map
-    from .pipeline import Pipeline
+    from .pipeline import Pipeline, warm_up
     from .preprocessing import preprocess
     from .runtime import init
     from .types import Frame, Mesh, PinholeCamera, PointCloud, Trajectory
@@ -43,6 +43,7 @@ __all__ = [
     "load_map",
     "open_dataset",
     "preprocess",
+    "warm_up",
 ]
 
 
@@ -54,7 +55,7 @@ _load, __dir__, _ = lazy_loader.attach(
         "preprocessing": ["preprocess"],
         "maps": ["SurfaceMap", "PropertyMap", "load_map"],
         "types": ["Frame", "PinholeCamera", "PointCloud", "Mesh", "Trajectory"],
-        "pipeline": ["Pipeline"],
+        "pipeline": ["Pipeline", "warm_up"],
         "config": ["Config", "load_config"],
         "errors": ["UniFusionError"],
     },

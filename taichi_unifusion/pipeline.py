@@ -4,6 +4,7 @@ them -> mesh (Fig. 7).
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,7 +24,9 @@ from .networks.encoders import ImageEncoder
 from .preprocessing import PreprocessSettings, preprocess
 from .properties import SurfaceProperty, make_property
 from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult
-from .types import Frame, Mesh
+from .types import Frame, Mesh, PinholeCamera
+
+logger = logging.getLogger(__name__)
 
 
 class Source(Protocol):
@@ -83,7 +86,9 @@ class Pipeline:
         Raises FrameError where the frame has no pose or no usable depth, OutOfRange where it lies
         beyond a map's index range, CapacityError where a map would grow beyond safe memory.
         """
-        clock = StageClock(self.synchronize)
+        clock, live = StageClock(self.synchronize), runtime.current()
+        if not live.warm:
+            logger.info("compiling kernels (once a process)")
         T_world_camera = frame.require_pose()
         frame, lacking = self._with_properties(frame, clock)
         with clock.stage("preprocess"):
@@ -97,6 +102,7 @@ class Pipeline:
             if names := group.names_in(cloud):
                 with clock.stage(" + ".join(names)):
                     done |= group.integrate(cloud)
+        live.warm = True
         return StepResult(frame.index, frame.name, len(cloud), done, clock.milliseconds, lacking)
 
     def _with_properties(self, frame: Frame, clock: StageClock) -> tuple[Frame, dict[str, str]]:
@@ -191,6 +197,18 @@ def extract_mesh(
         if len(source) and len(mesh.vertices):
             mesh = mesh.with_attribute(name, source.query(mesh.vertices))
     return mesh
+
+
+def warm_up(config: Config | None = None) -> None:
+    """Compile what a pipeline of these settings runs, which takes seconds, so that its first frame
+    takes no longer than the others; its kernels are also kept on disk for the next process.
+    """
+    pipeline = Pipeline(config)
+    depth = np.tile(np.linspace(0.8, 1.2, 64, dtype=np.float32), (48, 1))
+    color = np.full((48, 64, 3), 128, np.uint8)
+    camera = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    pipeline.step(Frame(depth, camera, color, np.eye(4)))
+    pipeline.extract_mesh()
 
 
 @dataclass

@@ -89,8 +89,10 @@ class Runtime:
     def __init__(self, device: str, description: str) -> None:
         self.device, self.description = device, description
         self.arena = Arena()
+        self.warm = False  # whether a pipeline has fused a frame, for which kernels are compiled
         self.trees = 0  # index trees made
-        self.free_trees: list[Any] = []  # those of maps that are gone: Taichi cannot free them
+        # those of maps that are gone, with what the maps held: Taichi cannot free them
+        self.free_trees: list[tuple[Any, Any]] = []
         self.grids: WeakSet[Any] = WeakSet()  # of the maps that live
         self.leaves: dict[Any, int] = {}  # index tree -> leaves that it ever had, at most
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import logging
+import sys
 import threading
 from dataclasses import replace
 
@@ -15,7 +17,7 @@ from taichi_unifusion.datasets.loading import load_ahead
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.errors import DatasetError, FrameError, OutOfRange, PoseError
 from taichi_unifusion.maps import Integration
-from taichi_unifusion.pipeline import Pipeline, extract_mesh
+from taichi_unifusion.pipeline import Pipeline, extract_mesh, warm_up
 from taichi_unifusion.preprocessing import PreprocessSettings
 from taichi_unifusion.run_log import SKIP_REASONS, EmptyFrame
 
@@ -326,3 +328,22 @@ def test_what_renders_with_kernels_is_loaded_by_the_caller(monkeypatch):
     for load in load_ahead(SyntheticRoom(frames=4, width=16, height=12)[::2][:2]):
         load()
     assert threads == [threading.main_thread()] * 2
+
+
+def compiled() -> int:
+    """Kernels that were traced in this process so far."""
+    names = [f"{room}kernels" for room in ("", "rendering.")]
+    modules = [m for name, m in sys.modules.items() if any(n in name for n in names)]
+    kernels = {id(k): k for m in modules for k in vars(m).values() if hasattr(k, "_primal")}
+    return sum(len(kernel._primal.compiled_kernels) for kernel in kernels.values())
+
+
+def test_after_warming_up_the_first_frame_compiles_nothing(frames):
+    gc.collect()  # what other tests left gives its index trees back now, not in between
+    warm_up(CONFIG)
+    warm = Pipeline(CONFIG)
+    before = compiled()
+    assert before > 20
+    warm.step(frames[0])
+    warm.extract_mesh()
+    assert compiled() == before

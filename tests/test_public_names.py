@@ -11,7 +11,7 @@ PUBLIC = {
     "taichi_unifusion": """
         Config Frame Mesh PinholeCamera Pipeline PointCloud PropertyMap SurfaceMap
         Trajectory UniFusionError __version__ init load_config load_map open_dataset
-        preprocess
+        preprocess warm_up
     """,
     "taichi_unifusion.datasets": """
         Dataset DatasetView FORMATS FormatOption format_options open_dataset parse_options

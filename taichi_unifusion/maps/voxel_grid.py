@@ -123,13 +123,15 @@ class VoxelGrid:
         if not free and self.runtime.trees >= runtime.MAX_TREES:
             gc.collect()  # maps that only a cycle holds, as the traceback of a run that failed
         if free:
-            tree = free.pop()
+            # one of an equal map, for which kernels are compiled already, if there is one
+            alike = [place for place, (fields, _) in enumerate(free) if fields == self.fields]
+            _, tree = free.pop(alike[-1] if alike else -1)
             tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
         else:
             self.runtime.count_tree()
             tree = _build_tree()
         if self.runtime.device == "cpu":
-            weakref.finalize(self, free.append, tree)
+            weakref.finalize(self, free.append, (self.fields, tree))
         return tree
 
     def next_frame(self) -> int:
