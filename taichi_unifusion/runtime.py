@@ -164,7 +164,8 @@ def init(
     if trouble and trouble != NO_DRIVER:  # there is a GPU, which somebody might want to use
         logger.warning("CUDA is not used: %s", trouble)
     _runtime = Runtime(found, _describe(found, threads))
-    _say(f"Taichi {'.'.join(map(str, ti.__version__))} on {_runtime.description}")
+    name = "Taichi" if ti.__name__ == "taichi" else ti.__name__
+    _say(f"{name} {'.'.join(map(str, ti.__version__))} on {_runtime.description}")
     return _runtime
 
 
@@ -215,7 +216,8 @@ def _quicken_tracing() -> None:
 
     context.ASTTransformerContext.get_pos_info = get_pos_info
     for name in ("getsourcefile", "getsourcelines"):
-        setattr(kernel_impl, name, cache(getattr(kernel_impl, name)))
+        if hasattr(kernel_impl, name):  # not in every build of Taichi
+            setattr(kernel_impl, name, cache(getattr(kernel_impl, name)))
 
 
 def _say(sentence: str) -> None:
