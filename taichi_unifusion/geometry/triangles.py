@@ -14,6 +14,7 @@ MAX_PIECES = 2_000_000  # 0.3 GB of search tree; larger surfaces get larger piec
 CANDIDATES = (24, 96)  # pieces tried for a point; the second number if the first may not suffice
 # [m] exact up to here; beyond, at most one piece's radius too long
 EXACT_M = 0.1
+FACE_CHUNK = 32_768  # areas computed at once: intermediate numbers stay in the cache
 POINT_CHUNK = 5_000  # points measured at once: some 150 MB of intermediate numbers at most
 
 
@@ -27,8 +28,12 @@ def area_vectors(vertices: NDArray, faces: NDArray) -> NDArray[np.floating]:
 
 def areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
     """Areas (F,) [m^2]."""
-    x, y, z = _cross_products(np.asarray(vertices, np.float64), faces)
-    return np.sqrt(x * x + y * y + z * z) / 2
+    vertices, found = np.asfortranarray(vertices, np.float64), np.empty(len(faces))
+    for start in range(0, len(faces), FACE_CHUNK):
+        part = slice(start, start + FACE_CHUNK)
+        x, y, z = _cross_products(vertices, faces[part])
+        found[part] = np.sqrt(x * x + y * y + z * z) / 2
+    return found
 
 
 def _cross_products(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:

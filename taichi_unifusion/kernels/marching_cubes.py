@@ -209,10 +209,9 @@ def emit_triangles(
                 for k in range(3):
                     e = triangle_edges[case, 3 * t + k]
                     cube, s = sample_at(q, ijk + row3(corner_edges, e), resolution, upper)
-                    vertex = first[cube, s]
-                    for d in range(corner_edges[e, 3]):  # vertices of a sample are numbered by axis
-                        vertex += edges[cube, s] >> d & 1
-                    faces[f, k] = vertex
+                    # vertices of a sample are numbered by axis
+                    before = edges[cube, s] & (1 << corner_edges[e, 3]) - 1
+                    faces[f, k] = first[cube, s] + ti.math.popcnt(before)
                 f += 1
 
 

@@ -73,8 +73,16 @@ def extract_mesh(
     sums = np.zeros((len(vertices), 3), np.int32)
     if len(faces):
         kernels.sum_normals(vertices, faces, NORMAL_UNIT * (resolution / voxel_size) ** 2, sums)
-    normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1)
-    return Mesh(vertices, faces, normals.astype(np.float32))
+    return Mesh(vertices, faces, _unit(sums))
+
+
+def _unit(sums: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Vectors (V, 3) of length 1, or 0 where there is none; by columns, which is faster."""
+    x, y, z = columns = np.ascontiguousarray(sums.T, np.float64)
+    lengths, unit = np.maximum(np.sqrt(x * x + y * y + z * z), 1), np.empty(sums.shape, np.float32)
+    for d in range(3):
+        unit[:, d] = columns[d] / lengths
+    return unit
 
 
 def cut_mesh(
