@@ -91,7 +91,7 @@ def classify_cells(
     edges: Ints2,  # (Q, R^3) |= bit d: a vertex lies on the edge from the sample along axis d
     cases: Bytes2,  # (Q, R^3) case of each cell; stays 0 where empty or unsupported
     # out:
-    triangles: Ints1,  # (Q,) triangles
+    counts: Ints2,  # (Q, 2) vertices on the edges from a cube's samples, triangles of its cells
 ):
     for q in range(sdf.shape[0]):
         total = 0
@@ -126,93 +126,84 @@ def classify_cells(
                 total += triangle_counts[case]
                 if triangle_counts[case] > 0:
                     mark_edges(edge_flags[case], q, ijk, resolution, upper, corner_edges, edges)
-        triangles[q] = total
-
-
-@ti.kernel
-def count_vertices(
-    # in:
-    edges: Ints2,  # (Q, R^3)
-    # out:
-    vertices: Ints1,  # (Q,)
-):
-    for q in range(edges.shape[0]):
+        counts[q, 1] = total
+    for q in range(sdf.shape[0]):  # once all cells have marked their edges
         total = 0
-        for s in range(edges.shape[1]):
-            for d in ti.static(range(3)):
-                total += edges[q, s] >> d & 1
-        vertices[q] = total
+        for s in range(sdf.shape[1]):
+            total += ti.math.popcnt(edges[q, s])
+        counts[q, 0] = total
 
 
 @ti.kernel
-def place_vertices(
+def emit_mesh(
     # in:
     resolution: ti.i32,
     keys: Ints2,  # (Q, 3) lattice corners, in voxels; a cube spans [key - 1/2, key + 1/2)
     upper: Ints2,  # (Q, 8)
     sdf: Floats2,  # (Q, R^3)
     edges: Ints2,  # (Q, R^3)
-    starts: Ints1,  # (Q + 1,) first vertex of each cube, and V
+    cases: Bytes2,  # (Q, R^3)
+    starts: Ints2,  # (Q + 1, 2) first vertex and triangle of each cube; at last V and F
+    triangle_counts: Ints1,  # (256,)
+    triangle_edges: Ints2,  # (256, 15) cell edges, three a triangle
+    corner_edges: Ints2,  # (12, 4)
     voxel_size: ti.f32,
     # in and out:
     first: Ints2,  # (Q, R^3) first vertex on the edges of a sample; as it was where there is none
     # out:
     vertices: Floats2,  # (V, 3) world [m]
-):
-    for q in range(sdf.shape[0]):
-        v, end = starts[q], starts[q + 1]
-        samples = sdf.shape[1] if v < end else 0
-        for s in range(samples):
-            crossed = edges[q, s]
-            if crossed != 0:
-                first[q, s] = v
-                ijk = ti.Vector(
-                    [s // (resolution * resolution), s // resolution % resolution, s % resolution]
-                )
-                for d in range(3):
-                    if crossed >> d & 1:
-                        along = ti.Vector([d == 0, d == 1, d == 2])
-                        cube, other = sample_at(q, ijk + ti.cast(along, ti.i32), resolution, upper)
-                        a, b = sdf[q, s], sdf[cube, other]
-                        x = (
-                            ti.cast(ijk, ti.f32) + ti.cast(along, ti.f32) * (a / (a - b))
-                        ) / resolution - 0.5
-                        for k in ti.static(range(3)):
-                            vertices[v, k] = (keys[q, k] + x[k]) * voxel_size
-                        v += 1
-
-
-@ti.kernel
-def emit_triangles(
-    # in:
-    resolution: ti.i32,
-    upper: Ints2,  # (Q, 8)
-    cases: Bytes2,  # (Q, R^3)
-    edges: Ints2,  # (Q, R^3)
-    first: Ints2,  # (Q, R^3)
-    starts: Ints1,  # (Q + 1,) first triangle of each cube, and F
-    triangle_counts: Ints1,  # (256,)
-    triangle_edges: Ints2,  # (256, 15) cell edges, three a triangle
-    corner_edges: Ints2,  # (12, 4)
-    # out:
     faces: Ints2,  # (F, 3)
 ):
-    for q in range(cases.shape[0]):
-        f, end = starts[q], starts[q + 1]
-        cells = cases.shape[1] if f < end else 0
+    for q in range(sdf.shape[0]):
+        v = starts[q, 0]
+        samples = sdf.shape[1] if v < starts[q + 1, 0] else 0
+        for s in range(samples):
+            if edges[q, s] != 0:
+                first[q, s] = v
+                for axis in range(3):
+                    if edges[q, s] >> axis & 1:
+                        x = crossing(q, s, axis, resolution, upper, sdf)
+                        for d in ti.static(range(3)):
+                            vertices[v, d] = (keys[q, d] + x[d]) * voxel_size
+                        v += 1
+    for q in range(sdf.shape[0]):
+        f = starts[q, 1]
+        cells = sdf.shape[1] if f < starts[q + 1, 1] else 0
         for c in range(cells):
             case = ti.cast(cases[q, c], ti.i32)
             for t in range(triangle_counts[case]):
-                ijk = ti.Vector(
-                    [c // (resolution * resolution), c // resolution % resolution, c % resolution]
-                )
                 for k in range(3):
                     e = triangle_edges[case, 3 * t + k]
-                    cube, s = sample_at(q, ijk + row3(corner_edges, e), resolution, upper)
+                    corner = lattice_place(c, resolution) + row3(corner_edges, e)
+                    cube, s = sample_at(q, corner, resolution, upper)
                     # vertices of a sample are numbered by axis
                     before = edges[cube, s] & (1 << corner_edges[e, 3]) - 1
                     faces[f, k] = first[cube, s] + ti.math.popcnt(before)
                 f += 1
+
+
+@ti.func
+def crossing(
+    q: ti.i32,
+    s: ti.i32,
+    axis: ti.i32,
+    resolution: ti.i32,
+    upper: ti.template(),
+    sdf: ti.template(),
+):
+    """Where the field is zero on the edge from sample s of cube q along an axis, in voxels from the
+    cube's key.
+    """
+    ijk, along = lattice_place(s, resolution), ti.Vector([axis == 0, axis == 1, axis == 2])
+    cube, other = sample_at(q, ijk + ti.cast(along, ti.i32), resolution, upper)
+    a, b = sdf[q, s], sdf[cube, other]
+    return (ti.cast(ijk, ti.f32) + ti.cast(along, ti.f32) * (a / (a - b))) / resolution - 0.5
+
+
+@ti.func
+def lattice_place(s: ti.i32, resolution: ti.i32):
+    """Sample or cell number s of a cube as an integer triple."""
+    return ti.Vector([s // (resolution * resolution), s // resolution % resolution, s % resolution])
 
 
 @ti.kernel

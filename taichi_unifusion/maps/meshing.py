@@ -255,41 +255,34 @@ def _march(
     keys, upper, support, sdf, resolution, voxel_size
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Vertices (V, 3) world [m] and faces (F, 3) of the zero level."""
-    counts, flags, table, edge_table = marching_cubes_tables()
+    triangle_counts, flags, table, edge_table = marching_cubes_tables()
     cases, edges = np.zeros(sdf.shape, np.uint8), np.zeros(sdf.shape, np.int32)
-    triangles, on_edges = np.empty(len(keys), np.int32), np.empty(len(keys), np.int32)
+    counts = np.empty((len(keys), 2), np.int32)  # vertices, triangles
     kernels.classify_cells(
-        resolution, upper, support, sdf, counts, edge_table, flags, edges, cases, triangles
+        resolution, upper, support, sdf, triangle_counts, edge_table, flags, edges, cases, counts
     )
-    kernels.count_vertices(edges, on_edges)
-    vertex_starts, triangle_starts = _starts(on_edges), _starts(triangles)
-    vertices, faces = (
-        np.empty((vertex_starts[-1], 3), np.float32),
-        np.empty((triangle_starts[-1], 3), np.int32),
-    )
-    if len(faces):
-        first = np.zeros(sdf.shape, np.int32)
-        kernels.place_vertices(
-            resolution, keys, upper, sdf, edges, vertex_starts, voxel_size, first, vertices
-        )
-        kernels.emit_triangles(
+    starts = np.zeros((len(keys) + 1, 2), np.int32)
+    np.cumsum(counts, axis=0, out=starts[1:])
+    first, (v, f) = np.zeros(sdf.shape, np.int32), starts[-1]
+    vertices, faces = np.empty((v, 3), np.float32), np.empty((f, 3), np.int32)
+    if f:
+        kernels.emit_mesh(
             resolution,
+            keys,
             upper,
-            cases,
+            sdf,
             edges,
-            first,
-            triangle_starts,
-            counts,
+            cases,
+            starts,
+            triangle_counts,
             table,
             edge_table,
+            voxel_size,
+            first,
+            vertices,
             faces,
         )
     return vertices, faces
-
-
-def _starts(counts: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Where each of counts (Q,) starts when they stand in a row, and where the last ends (Q + 1,)."""
-    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
 
 
 @lru_cache(maxsize=1)

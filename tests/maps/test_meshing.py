@@ -130,13 +130,13 @@ def twin_cases(patchy) -> np.ndarray:
 
 def classified(patchy):
     keys, upper, samples, support, _ = patchy
-    counts, flags, table, edge_table = meshing.marching_cubes_tables()
+    triangle_counts, flags, _, edge_table = meshing.marching_cubes_tables()
     cases, edges = np.zeros(samples.shape, np.uint8), np.zeros(samples.shape, np.int32)
-    triangles = np.empty(len(keys), np.int32)
+    counts = np.empty((len(keys), 2), np.int32)
     kernels.classify_cells(
-        R, upper, support, samples, counts, edge_table, flags, edges, cases, triangles
+        R, upper, support, samples, triangle_counts, edge_table, flags, edges, cases, counts
     )
-    return cases, edges, triangles
+    return cases, edges, counts
 
 
 def lattice(patchy, values) -> np.ndarray:
@@ -147,8 +147,9 @@ def lattice(patchy, values) -> np.ndarray:
     return whole
 
 
-def test_classify_cells_and_count_vertices_equal_their_twins(patchy):
-    cases, edges, triangles = classified(patchy)
+def test_classify_cells_equals_its_twin(patchy):
+    """Also the vertices and triangles that it counts."""
+    cases, edges, counts = classified(patchy)
     twin = twin_cases(patchy)
     np.testing.assert_array_equal(lattice(patchy, cases), twin)
     assert len(np.unique(twin)) > 50
@@ -158,31 +159,24 @@ def test_classify_cells_and_count_vertices_equal_their_twins(patchy):
         for d in range(3)
         for at in map(tuple, np.argwhere(lattice(patchy, edges) >> d & 1).tolist())
     } == crossed
+    vertices, triangles = counts.T
     np.testing.assert_array_equal(triangles, meshing.marching_cubes_tables()[0][cases].sum(axis=1))
-    vertices = np.empty(len(cases), np.int32)
-    kernels.count_vertices(edges, vertices)
     assert vertices.sum() == len(crossed)
     np.testing.assert_array_equal(vertices, sum((edges >> d & 1).sum(axis=1) for d in range(3)))
 
 
-def test_place_vertices_and_emit_triangles_equal_their_twins(patchy):
+def test_emit_mesh_equals_its_twin(patchy):
     """One vertex on every crossed edge, where the field is zero; every cell's triangles join the
     vertices of its own edges.
     """
     keys, upper, samples, support, whole = patchy
     vertices, faces = meshing._march(keys, upper, support, samples, R, VS)
-    cases = twin_cases(patchy)
-    first = np.array([-1, 5, 0])
-    place = {
-        edge: reference.place_vertices(whole, edge, R, first, VS)
-        for edge in reference.crossed_edges(cases)
-    }
-    found = sorted(map(tuple, vertices.astype(float).tolist()))
-    np.testing.assert_allclose(
-        found, sorted(map(tuple, np.array(list(place.values())).tolist())), atol=ROUNDING
-    )
     edge_table = meshing.marching_cubes_tables()[3]
-    wanted = reference.emit_triangles(cases, triangles_of, edge_table, place)
+    places, wanted = reference.emit_mesh(
+        whole, twin_cases(patchy), R, np.array([-1, 5, 0]), VS, triangles_of, edge_table
+    )
+    found = sorted(map(tuple, vertices.astype(float).tolist()))
+    np.testing.assert_allclose(found, sorted(map(tuple, places.tolist())), atol=ROUNDING)
     emitted = vertices[faces].reshape(-1, 9)
     assert wanted.shape == emitted.shape
     nearest = np.abs(wanted[:, None] - emitted[None]).max(axis=2).argmin(axis=1)

@@ -468,7 +468,7 @@ def crossed_edges(cases):
     return edges
 
 
-def place_vertices(field, edge, resolution, corner, voxel_size):
+def place_vertex(field, edge, resolution, corner, voxel_size):
     """Where the field is zero on an edge, linearly [m]."""
     low = np.array(edge[:3])
     step = np.eye(3, dtype=int)[edge[3]]
@@ -476,11 +476,16 @@ def place_vertices(field, edge, resolution, corner, voxel_size):
     return (corner - 0.5 + (low + step * a / (a - b)) / resolution) * voxel_size
 
 
-def emit_triangles(cases, triangles_of, edge_table, place):
-    """(T, 9) corners of all triangles: those of each cell's case, on the cell's own edges.
+def emit_mesh(field, cases, resolution, corner, voxel_size, triangles_of, edge_table):
+    """The vertices (V, 3), and the corners of all triangles (T, 9): those of each cell's case, on
+    the cell's own edges.
 
-    `triangles_of(case)` gives edges of a cell, three a triangle; `place` where an edge's vertex is.
+    `triangles_of(case)` gives edges of a cell, three a triangle.
     """
+    place = {
+        edge: place_vertex(field, edge, resolution, corner, voxel_size)
+        for edge in crossed_edges(cases)
+    }
     corners = []
     for cell in np.argwhere(cases):
         for triangle in triangles_of(cases[tuple(cell)]):
@@ -488,7 +493,7 @@ def emit_triangles(cases, triangles_of, edge_table, place):
                 (*(cell + edge_table[e, :3]).tolist(), int(edge_table[e, 3])) for e in triangle
             ]
             corners.append(np.concatenate([place[edge] for edge in edges]))
-    return np.array(corners)
+    return np.array(list(place.values())), np.array(corners)
 
 
 def face_segments(case):
