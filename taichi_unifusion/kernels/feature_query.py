@@ -7,6 +7,7 @@ See `features.py` for what a voxel keeps.
 import taichi as ti
 
 from .arrays import Bytes1, Floats1, Floats2, Floats3, Rows2, row3
+from .encoding import table_features
 from .index import INDEX_HALF, all_within, find, voxel_of
 from .query import nearest_voxel
 
@@ -122,27 +123,6 @@ def solve_rows(
                 mean -= moments[s, a, 0] * F[a]
                 products[s, 1 + a, t] = F[a]
             products[s, 0, t] = mean
-
-
-@ti.func
-def table_features(t: ti.template(), rank: ti.template(), table: ti.template(), nodes: ti.i32):
-    """Position features at t by trilinear interpolation in a table of nodes^3 rows that spans
-    [-0.5, 0.5]^3.
-    """
-    x = (t + 0.5) * (nodes - 1)
-    corner = ti.math.clamp(ti.floor(x, ti.i32), 0, nodes - 2)
-    r = x - corner
-    f = ti.Vector([0.0] * rank)
-    for o in ti.static(range(8)):
-        step = ti.Vector([o // 4, o // 2 % 2, o % 2])
-        at = corner + step
-        share = 1.0
-        for d in ti.static(range(3)):
-            share *= r[d] if ti.static((o, o // 2, o // 4)[2 - d] % 2 == 1) else 1.0 - r[d]
-        row = (at[0] * nodes + at[1]) * nodes + at[2]
-        for a in ti.static(range(rank)):
-            f[a] += share * table[row, a]
-    return f
 
 
 @ti.kernel

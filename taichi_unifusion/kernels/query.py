@@ -6,7 +6,7 @@ import taichi as ti
 
 from .arrays import Bytes1, Floats2, Floats3, Ints2, Masks2, row3
 from .cells import BLOCK_CELLS, CELLS, cell_bit, cell_index, first_cell
-from .encoding import position_features
+from .encoding import table_features
 from .index import INDEX_HALF, all_within, find, voxel_of
 
 UNKNOWN = 1e9  # signed distance where no voxel reaches
@@ -18,13 +18,12 @@ def decode(
     s: ti.i32,
     t: ti.template(),
     latents: ti.template(),
-    anchors: ti.template(),
-    projection: ti.template(),
-    scale: ti.f32,
+    table: ti.template(),
+    nodes: ti.i32,
 ):
     """f_dec(t, F) of the voxel in slot s, plus its prior mean (Eq. 7)."""
     rank, channels = ti.static(layout.rank, layout.channels)
-    f = position_features(t, rank, anchors, projection, scale)
+    f = table_features(t, rank, table, nodes)
     values = ti.Vector([0.0] * channels)
     for c in ti.static(range(channels)):
         value = latents[s, rank, c] if ti.static(layout.centered) else 0.0
@@ -62,9 +61,8 @@ def query_points(
     per_meter: ti.f32,
     index: ti.template(),
     latents: Floats3,  # (S, l [+ 1], c)
-    anchors: Floats2,  # (3, A)
-    projection: Floats2,  # (l, A)
-    scale: ti.f32,
+    table: Floats2,  # (nodes^3, l) f_posi on a lattice over the doubled voxel
+    nodes: ti.i32,
     # points that no voxel covers take the value of the nearest one within this many voxels
     reach: ti.i32,
     # out:
@@ -93,7 +91,7 @@ def query_points(
                             tent *= ti.max(1.0 - 2.0 * ti.abs(t[d]), 0.0)
                         # on the border of the only voxel there is, its value still counts
                         tent = ti.max(tent, 1e-6)
-                    total += tent * decode(layout, s, t, latents, anchors, projection, scale)
+                    total += tent * decode(layout, s, t, latents, table, nodes)
                     weight += tent
                     covered += ti.cast(o < covering, ti.i32)
         valid[n] = ti.cast(covered > 0, ti.u8)

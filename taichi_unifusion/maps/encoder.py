@@ -14,13 +14,14 @@ from ..errors import InputError
 from ..kernels import query, regression
 from ..kernels.cells import CELLS
 from ..kernels.layout import Layout
-from ..runtime import DeviceArray, Runtime
+from ..runtime import Arena, DeviceArray, Runtime
 from .encoding import position_encoding
 from .local_lim import Binned, LocalLim, SortedSamples
 from .settings import MapSettings
 from .voxel_grid import VoxelGrid
 
 CPU_WORKERS, GPU_WORKERS = 64, 8192
+NODES = 33  # of the lattice of f_posi that decoding reads, along an edge of the doubled voxel
 
 
 class Encoder:
@@ -33,7 +34,7 @@ class Encoder:
     def __init__(self, runtime: Runtime, settings: MapSettings, layout: Layout) -> None:
         self.layout, self.arena = layout, runtime.arena
         self.min_points, self.noise = settings.min_points, settings.noise
-        self.tables = PositionTables(settings)
+        self.tables = PositionTables(settings, runtime.arena)
         self.window = window_masks(settings.margin)
         self.cell_features = to_device(self._cell_features())
         self.tiles = _tiles(runtime, layout)
@@ -118,13 +119,23 @@ class Encoder:
 
 
 class PositionTables:
-    """What kernels need to evaluate f_posi exactly."""
+    """What kernels need of f_posi: for samples exactly, for decoding on a lattice."""
 
-    def __init__(self, settings: MapSettings) -> None:
-        self.encoding = position_encoding(settings.encoder)
+    def __init__(self, settings: MapSettings, arena: Arena) -> None:
+        self.encoding, self.arena = position_encoding(settings.encoder), arena
         self.scale = float(np.sqrt(7.0) / settings.encoder.length_scale)
         self.anchors = to_device((self.encoding.anchors * self.scale).T)  # (3, A)
         self.projection = to_device(self.encoding.projection.T)  # (l, A)
+
+    @property
+    def lattice(self) -> DeviceArray:
+        """(NODES^3, l) f_posi over the doubled voxel, made at the first query and shared by all
+        maps of these encoder settings.
+        """
+        settings, shape = self.encoding.settings, (NODES, NODES, NODES)
+        return self.arena.exact(
+            f"lattice of {settings}", lambda: to_device(self.encoding.lattice(NODES)), shape
+        )
 
 
 class Decoder:
@@ -151,9 +162,8 @@ class Decoder:
                 1.0 / self.voxel_size,
                 grid.index,
                 grid["latents"],
-                self.tables.anchors,
-                self.tables.projection,
-                self.tables.scale,
+                self.tables.lattice,
+                NODES,
                 reach,
                 values,
                 valid,

@@ -79,9 +79,7 @@ class FeatureMap(BaseMap[FeatureSettings]):
         self.binner = Binner(self.grid, settings.voxel_size, 0, with_positions=True)
         encoding = position_encoding(settings.encoder)
         self._cell_features = to_device(encoding(encoding.nodes(2 * CELLS))[:, 1:])
-        axis = np.linspace(-0.5, 0.5, NODES)
-        nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        self._table = to_device(encoding(nodes)[:, 1:])
+        self._table = to_device(encoding.lattice(NODES)[:, 1:])
         self._window = window_masks(settings.margin)
         self._scratch = self._borrow_scratch()
 

@@ -13,6 +13,7 @@ from taichi_unifusion.errors import InputError, RuntimeStateError
 from taichi_unifusion.kernels import query as kernels
 from taichi_unifusion.kernels.index import INDEX_HALF
 from taichi_unifusion.maps import PropertyMap, SurfaceMap
+from taichi_unifusion.maps.encoder import NODES
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.meshing import STEPS, grid_basis
 from taichi_unifusion.maps.property_map import NEAREST_REACH
@@ -20,6 +21,7 @@ from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
 SETTINGS = {"encoder": EncoderSettings(rank=6, anchors=64), "voxel_size": 0.05}
 ENCODER = reference.Encoder(6, 64)
+INTERPOLATED = reference.Interpolated(ENCODER, NODES)  # at points; test_encoding.py has its error
 DECODED = 1e-4  # float32 features (2e-5) times some latents of size 1
 # a point on the rim of a doubled voxel keeps this weight per axis, so that its value is defined
 TINY_TENT = 1e-6
@@ -88,7 +90,7 @@ def test_query_points_equals_its_twin(channels, prior, blend):
     voxels, points = fill(target.grid, channels), points_about_the_voxels()
     values, valid = target.query(points, return_valid=True)
     twin, known = reference.query_points(
-        ENCODER,
+        INTERPOLATED,
         voxels,
         in_voxels(points),
         blend=blend,
@@ -109,7 +111,7 @@ def test_sdf_is_in_metres_and_blended(surface):
     target, voxels = surface
     points = points_about_the_voxels()
     values, valid = target.sdf(points)
-    twin, known = reference.query_points(ENCODER, voxels, in_voxels(points), blend=True)
+    twin, known = reference.query_points(INTERPOLATED, voxels, in_voxels(points), blend=True)
     np.testing.assert_array_equal(valid, known)
     assert values.dtype == np.float32 and valid.dtype == bool and values.shape == (len(points),)
     np.testing.assert_allclose(values, 0.05 * twin[:, 0], atol=0.05 * DECODED)

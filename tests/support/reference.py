@@ -14,6 +14,7 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 CELLS = 4  # support and averaging cells per voxel edge
 UNKNOWN = 1e9  # signed distance where no voxel reaches
@@ -69,6 +70,32 @@ class Encoder:
     def gradient(self, t, h=1e-5):
         """Eq. 14 by central differences, good to about 1e-9: (N, 3, l)."""
         return np.stack([(self(t + h * e) - self(t - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
+
+
+@dataclass(frozen=True)
+class Interpolated:
+    """f_posi as decoding reads it: trilinear between nodes^3 values, the cube's faces included."""
+
+    encoder: Encoder
+    nodes: int
+
+    @property
+    def rank(self):
+        return self.encoder.rank
+
+    @cached_property
+    def lattice(self):
+        axis = np.linspace(-0.5, 0.5, self.nodes)
+        t = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+        values = np.stack([self.encoder(plane.reshape(-1, 3)) for plane in t])
+        return RegularGridInterpolator([axis] * 3, values.reshape(*t.shape[:3], -1))
+
+    def __call__(self, t):
+        return self.lattice(np.clip(t, -0.5, 0.5))
+
+
+def interpolate_positions(encoder, t):
+    return encoder(t)
 
 
 def encode_positions(encoder, t):
