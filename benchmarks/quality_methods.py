@@ -98,9 +98,7 @@ def tsdf(
         import open3d as o3d
         from open3d.core import Device, Tensor, float32
     except ImportError:
-        raise MissingDependency(
-            "the TSDF needs Open3D: pip install 'taichi-unifusion[open3d]'"
-        ) from None
+        raise MissingDependency("the TSDF needs Open3D: pip install '.[open3d]'") from None
 
     cpu, far = Device("CPU:0"), DEPTH_RANGE[1]
     grid = o3d.t.geometry.VoxelBlockGrid(

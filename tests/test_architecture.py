@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "taichi_unifusion"
-# The method's page and its ground; everything else has a room.
+# What every part uses, and the method itself; everything else lies in a folder, a room.
 LOOSE_FILES = {"__init__", "types", "errors", "runtime", "config", "preprocessing", "pipeline"} | {
     "run_log"
 }

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ..config import Config
-from ..datasets import FORMATS, Dataset, open_dataset, parse_options
+from ..datasets import FORMATS, Dataset, format_options, open_dataset, parse_options
 from ..errors import DatasetError, InputError
 from ..results.record import Source
 from ..tracking import Mode
@@ -54,7 +54,7 @@ class RecordingOptions:
     max_difference: Annotated[
         float | None, arg(metavar="SECONDS", help_behavior_hint=FORMAT_DEFAULT)
     ] = None
-    """How far time stamps of depth, colour and pose may be apart (tum, folder)."""
+    """How far time stamps of depth, colour and pose may be apart (tum, folder, k4a)."""
     camera_path: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(scene needs one)")
     ] = None
@@ -167,6 +167,8 @@ def reading_options(options: RecordingOptions) -> dict[str, Any]:
         "trajectory": options.camera_path,
     }
     given = {name: value for name, value in flags.items() if value is not None}
+    if options.camera_path is not None and "trajectory" not in format_options(options.format):
+        raise InputError(f"--camera-path: format '{options.format}' has poses of its own; drop it")
     return merged_options(options.format, given, options.option)
 
 

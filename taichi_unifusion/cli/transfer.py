@@ -17,8 +17,7 @@ from .reconstruct import Reconstruct, reconstruct
 
 @dataclass(frozen=True)
 class Transfer(Reconstruct):
-    """Map properties of the frames (infrared, saliency, style, ...) onto the surface, beside its
-    colour, in one pass.
+    """Map properties (infrared, saliency, style, ...) onto the surface, beside its colour.
 
     Example: unifusion transfer 7scenes my/redkitchen --property saliency --property style=sketch
     --out results/kitchen

@@ -13,8 +13,7 @@ from .reconstruct import Reconstruct, fuse
 
 @dataclass(frozen=True)
 class Understand(Reconstruct):
-    """Map image-text features (CLIP and its kin) onto the surface, beside its colour, in one pass;
-    then ask with `query`.
+    """Map image-text features, such as CLIP's, onto the surface; then ask with `query`.
 
     Example: unifusion understand 7scenes my/redkitchen --every 10 --features
     clip:models/clip-vit-b16 --out results/kitchen

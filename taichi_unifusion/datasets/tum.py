@@ -175,6 +175,7 @@ def _camera(
     reason = "from the folder's name" if match else "as the folder's name tells no other"
     warnings.append(
         f"intrinsics assumed: {name} ({camera.fx:g} {camera.fy:g} {camera.cx:g} {camera.cy:g}, distortion ignored) "
-        f"{reason}; pass camera=PinholeCamera(...) to change them"
+        f"{reason}; to give others, use format 'folder' with a camera.yaml, or in Python "
+        "camera=PinholeCamera(...)"
     )
     return camera

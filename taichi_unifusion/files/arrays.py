@@ -114,8 +114,7 @@ def _open_torch(path: Path) -> Any:
         import torch  # pyright: ignore[reportMissingImports] - an extra, often not installed
     except ImportError:
         raise MissingDependency(
-            f"{path}: .pt files are read by torch: pip install 'taichi-unifusion[clip]', or save "
-            ".npy"
+            f"{path}: .pt files are read by torch: pip install torch, or save .npy"
         ) from None
     if not path.exists():
         raise FileNotFoundError

@@ -109,8 +109,8 @@ def _tracks(container: Any, path: Path) -> dict[str, Any]:
     }
     if DEPTH not in streams:
         raise DatasetError(
-            f"{path}: has no track DEPTH, only {', '.join(map(_title, container.streams.video)) or 'no video'}; "
-            "is this a recording of an Azure Kinect?"
+            f"{path}: has no track DEPTH (it has {', '.join(map(_title, container.streams.video)) or 'no images'}); "
+            "give the .mkv file of an Azure Kinect"
         )
     for title in (DEPTH, INFRARED):
         if title in streams and streams[title].codec_context.pix_fmt != "gray16be":
@@ -138,6 +138,6 @@ def _import_av() -> ModuleType:
         import av
     except ImportError:
         raise MissingDependency(
-            "recordings of an Azure Kinect are read with PyAV: pip install 'taichi-unifusion[k4a]'"
+            "recordings of an Azure Kinect are read with PyAV: pip install av"
         ) from None
     return av

@@ -43,6 +43,10 @@ def inspect(path: Path) -> Inspection:
         raise FileError(f"{path}: no such file or folder")
     elif path.suffix.lower() == ".ply":
         maps, mesh, record = [], path, None
+    elif path.suffix.lower() in (".glb", ".obj"):
+        raise FileError(
+            f"{path}: of meshes only PLY is described; try {path.with_suffix('.ply').name}"
+        )
     else:
         maps, mesh, record = [path], None, None
     problems: list[UniFusionError] = []

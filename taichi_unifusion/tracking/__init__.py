@@ -105,8 +105,10 @@ def make_tracker(
     kind = _kind(mode)
     if not kind.reads_trajectory and (trajectory is not None or interpolate):
         readers = [name for name in TRACKERS if _kind(name).reads_trajectory]
+        what = "--interpolate fills gaps of" if trajectory is None else "--trajectory names"
         raise InputError(
-            f"tracking: {mode} reads no trajectory file; use {' or '.join(readers)} with it"
+            f"tracking: {what} a trajectory file, which '{mode}' does not read; use "
+            f"{' or '.join(readers)} with it"
         )
     source = PoseSource(trajectory, interpolate, max_difference)
     return kind.make(settings or TrackingSettings(), preprocess or PreprocessSettings(), source)

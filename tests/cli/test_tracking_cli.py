@@ -149,7 +149,10 @@ def test_S2_a_recording_without_poses_is_one_sentence_that_says_what_is_missing(
         (["--tracking", "slam"], "rgbd"),
         (["--tracking", "external"], "external needs a trajectory file"),
         (["--tracking", "external", "--trajectory", "nowhere.txt"], "nowhere.txt: no such file"),
-        (["--trajectory", "x.txt"], "given reads no trajectory file"),
+        (
+            ["--trajectory", "x.txt"],
+            "--trajectory names a trajectory file, which 'given' does not read",
+        ),
         (["--tracking.window", "0"], "window >= 1"),
     ],
 )

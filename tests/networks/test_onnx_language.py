@@ -18,9 +18,7 @@ from taichi_unifusion.language import (
 from taichi_unifusion.networks.clip import NORMALIZATION
 
 onnx = pytest.importorskip("onnx", reason="writing test networks needs the package onnx")
-pytest.importorskip(
-    "onnxruntime", reason="needs onnxruntime: pip install 'taichi-unifusion[models]'"
-)
+pytest.importorskip("onnxruntime", reason="needs onnxruntime: pip install onnxruntime")
 
 FLOAT, INT32, INT64 = 1, 6, 7  # ONNX's numbers of the types
 CLOSE = 1e-4
