@@ -11,11 +11,12 @@ from places import DATA, DEVICE
 
 import taichi_unifusion as uf
 
-twin_calls.record_twins()  # before a test imports them
-
 
 def pytest_configure(config: pytest.Config) -> None:
-    twin_calls.record_kernels()
+    if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
+        # this process runs tests, and does not only hand them out
+        twin_calls.record_twins()  # before a test imports them
+        twin_calls.record_kernels()
     config.pluginmanager.register(twin_calls.TwinCalls())
     config.addinivalue_line(
         "markers", "data: reads a real recording; skipped where it is not at hand"

@@ -59,10 +59,8 @@ def _recording(entry: str, function: FunctionType):
 
 def record_kernels() -> None:
     """Note every launch; a kernel of Taichi is an object that holds the function it was made of."""
-    import taichi
     from taichi.lang import kernel_impl
 
-    taichi.set_logging_level("error")  # also in a process that only collects reports
     launch = kernel_impl.Kernel.__call__
 
     @functools.wraps(launch)

@@ -232,8 +232,8 @@ def test_a_trajectory_of_another_recording_is_an_error_with_both_ranges(walk, tm
     [
         ("slam", {}, "choose one of given, external, internal, rgbd"),
         ("external", {}, "--trajectory"),
-        ("rgbd", {"trajectory": "x"}, "reads no trajectory"),
-        ("given", {"interpolate": True}, "reads no trajectory"),
+        ("rgbd", {"trajectory": "x"}, "which 'rgbd' does not read"),
+        ("given", {"interpolate": True}, "--interpolate fills gaps"),
         ("external", {"trajectory": "nowhere"}, "no such file"),
     ],
 )
