@@ -87,9 +87,10 @@ class Pipeline:
         beyond a map's index range, CapacityError where a map would grow beyond safe memory.
         """
         clock, live = StageClock(self.synchronize), runtime.current()
-        if not live.warm:
-            logger.info("compiling kernels (once a process)")
         T_world_camera = frame.require_pose()
+        if not live.warm:  # once, also where the first frames turn out to be of no use
+            logger.info("compiling kernels (once a process)")
+            live.warm = True
         frame, lacking = self._with_properties(frame, clock)
         with clock.stage("preprocess"):
             cloud = preprocess(frame, self.config.preprocess)
@@ -102,7 +103,6 @@ class Pipeline:
             if names := group.names_in(cloud):
                 with clock.stage(" + ".join(names)):
                     done |= group.integrate(cloud)
-        live.warm = True
         return StepResult(frame.index, frame.name, len(cloud), done, clock.milliseconds, lacking)
 
     def _with_properties(self, frame: Frame, clock: StageClock) -> tuple[Frame, dict[str, str]]:

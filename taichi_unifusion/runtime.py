@@ -89,7 +89,9 @@ class Runtime:
     def __init__(self, device: str, description: str) -> None:
         self.device, self.description = device, description
         self.arena = Arena()
-        self.warm = False  # whether a pipeline has fused a frame, for which kernels are compiled
+        self.warm = (
+            False  # whether a pipeline has begun with a frame, for which kernels are compiled
+        )
         self.trees = 0  # index trees made
         # those of maps that are gone, with what the maps held: Taichi cannot free them
         self.free_trees: list[tuple[Any, Any]] = []

@@ -16,7 +16,22 @@ from .encoder import Encoder
 from .property_map import PropertyMap, encode_values
 
 
-class PropertyGroup:
+class MapGroup:
+    """Maps that are given the same clouds; this one fuses each of them by itself."""
+
+    def __init__(self, maps: Sequence[BaseMap]) -> None:
+        self.maps = tuple(maps)
+
+    def names_in(self, cloud: PointCloud) -> list[str]:
+        """The names of the maps that want a cloud."""
+        return [each.name for each in self.maps if each.wants(cloud)]
+
+    def integrate(self, cloud: PointCloud) -> dict[str, Integration]:
+        """Fuse a cloud in world coordinates into the maps that want it; by name what that did."""
+        return {each.name: each.integrate(cloud) for each in self.maps if each.wants(cloud)}
+
+
+class PropertyGroup(MapGroup):
     """Property maps that take their voxels, position features and factorised Gram matrices from one
     computation a frame.
 
@@ -28,8 +43,10 @@ class PropertyGroup:
     frames that others have, and is saved, loaded and merged alone.
     """
 
+    maps: tuple[PropertyMap, ...]
+
     def __init__(self, maps: Sequence[PropertyMap]) -> None:
-        self.maps = tuple(maps)
+        super().__init__(maps)
         first = self.maps[0]
         for other in self.maps[1:]:
             if other.settings != first.settings:
@@ -38,10 +55,6 @@ class PropertyGroup:
                     f"{first.settings} and {other.settings}"
                 )
         self._encoders: dict[Layout, Encoder] = {}
-
-    def names_in(self, cloud: PointCloud) -> list[str]:
-        """The names of the maps whose attribute a cloud has."""
-        return [each.name for each in self.maps if each.wants(cloud)]
 
     def integrate(self, cloud: PointCloud) -> dict[str, Integration]:
         """Fuse a cloud in world coordinates into the maps whose attribute it has; by name what that
@@ -56,7 +69,7 @@ class PropertyGroup:
         ]
         # nothing to share; a map whose values are not all finite leaves points out
         if len(finite) < 2 or not len(cloud):
-            return {each.name: each.integrate(cloud) for each in present}
+            return super().integrate(cloud)
         done = self._integrate_together(finite, cloud)
         return done | {each.name: each.integrate(cloud) for each in present if each not in finite}
 
@@ -90,22 +103,7 @@ class PropertyGroup:
         return self._encoders[layout]
 
 
-class Alone:
-    """A map that shares its encoding with no other."""
-
-    def __init__(self, only: BaseMap) -> None:
-        self.maps = (only,)
-
-    def names_in(self, cloud: PointCloud) -> list[str]:
-        """The map's name, if it wants the cloud."""
-        return [each.name for each in self.maps if each.wants(cloud)]
-
-    def integrate(self, cloud: PointCloud) -> dict[str, Integration]:
-        """Fuse a cloud in world coordinates, if the map wants it; by name what that did."""
-        return {each.name: each.integrate(cloud) for each in self.maps if each.wants(cloud)}
-
-
-def group_maps(maps: Iterable[BaseMap]) -> list[PropertyGroup | Alone]:
+def group_maps(maps: Iterable[BaseMap]) -> list[MapGroup]:
     """The maps in their order, property maps of equal settings together."""
     groups: dict[object, list[BaseMap]] = {}
     for each in maps:
@@ -114,6 +112,6 @@ def group_maps(maps: Iterable[BaseMap]) -> list[PropertyGroup | Alone]:
     return [
         PropertyGroup(together)
         if (together := [each for each in members if isinstance(each, PropertyMap)])
-        else Alone(members[0])
+        else MapGroup(members)
         for members in groups.values()
     ]
