@@ -9,7 +9,7 @@ import taichi as ti
 from .arrays import Bytes1, Floats1, Floats2, Floats3, Rows2, row3
 from .encoding import table_features
 from .index import INDEX_HALF, all_within, find, voxel_of
-from .query import nearest_voxel
+from .query import nearest_voxel, tent_weight
 
 DIRECTIONS = 4  # texts that are worked on at once
 
@@ -158,11 +158,7 @@ def query_products(
                     s, ijk = nearest_voxel(x, reach, index)
                 if s >= 0:
                     at = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
-                    tent = 1.0
-                    for d in ti.static(range(3)):
-                        tent *= ti.max(1.0 - 2.0 * ti.abs(at[d]), 0.0)
-                    # on the border of the only voxel there is, its value still counts
-                    tent = ti.max(tent, 1e-6)
+                    tent = tent_weight(at)
                     f = table_features(at, rank, table, nodes)
                     shares[found * (1 + rank)] = tent
                     for a in ti.static(range(rank)):

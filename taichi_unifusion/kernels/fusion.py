@@ -5,7 +5,7 @@ regression over all frames.
 import taichi as ti
 
 from .arrays import Floats1, Floats2, Floats3, Ints1, Masks2
-from .regression import solve_voxel
+from .gram import solve_voxel
 
 # weights are numbers of points; a remainder below this is rounding and counts as empty
 LEAST_WEIGHT = 0.5

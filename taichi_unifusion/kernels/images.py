@@ -20,6 +20,19 @@ def segment_length() -> int:
     return 80 if ti.lang.impl.current_cfg().arch in (ti.x64, ti.arm64) else 1
 
 
+@ti.func
+def segments(width: ti.i32) -> ti.i32:
+    """How many segments a row has."""
+    return (width + ti.static(segment_length()) - 1) // ti.static(segment_length())
+
+
+@ti.func
+def segment(part: ti.i32, width: ti.i32):
+    """Row, first pixel and end of segment `part` of an image."""
+    v, first = part // segments(width), part % segments(width) * ti.static(segment_length())
+    return v, first, ti.min(first + ti.static(segment_length()), width)
+
+
 @ti.kernel
 def clip_depth(
     # in:
@@ -31,11 +44,9 @@ def clip_depth(
 ):
     low, high = ti.bit_cast(depth_min, ti.i32), ti.bit_cast(depth_max, ti.i32)
     height, width = depth.shape[0], depth.shape[1]
-    length = ti.static(segment_length())
-    segments = (width + length - 1) // length
-    for part in range(height * segments):
-        v, first = part // segments, part % segments * length
-        for u in range(first, ti.min(first + length, width)):
+    for part in range(height * segments(width)):
+        v, first, end = segment(part, width)
+        for u in range(first, end):
             # ordered as positive floats are; NaN and inf lie above, negatives below
             bits = ti.bit_cast(depth[v, u], ti.i32)
             clipped[v, u] = depth[v, u] if bits >= low and bits <= high else 0.0
@@ -51,11 +62,9 @@ def drop_flying_pixels(
     inverse: Floats2,  # (H, W) [1/m], 0 where there is no reading or a flying pixel
 ):
     height, width = depth.shape[0], depth.shape[1]
-    length = ti.static(segment_length())
-    segments = (width + length - 1) // length
-    for part in range(height * segments):
-        v, first = part // segments, part % segments * length
-        for u in range(first, ti.min(first + length, width)):
+    for part in range(height * segments(width)):
+        v, first, end = segment(part, width)
+        for u in range(first, end):
             z = depth[v, u]
             close = 0
             if z > 0 and v > 0 and u > 0 and v < height - 1 and u < width - 1:

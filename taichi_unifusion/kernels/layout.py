@@ -39,7 +39,7 @@ class Layout:
 
     @property
     def sums(self) -> int:
-        """Numbers that a regression sums up for a voxel, as `regression.keep_sums` lays them out."""
+        """Numbers that a regression sums up for a voxel, as `gram.keep_sums` lays them out."""
         lower_half = self.size * (self.size + 1) // 2
         return lower_half + self.size * (self.channels + self.centered) + self.channels
 

@@ -51,6 +51,15 @@ def nearest_voxel(x: ti.template(), reach: ti.i32, index: ti.template()):
     return found, at
 
 
+@ti.func
+def tent_weight(t: ti.template()) -> ti.f32:
+    """Weight of a voxel at encoder coordinates t in [-0.5, 0.5]^3 when voxels are blended."""
+    tent = 1.0
+    for d in ti.static(range(3)):
+        tent *= ti.max(1.0 - 2.0 * ti.abs(t[d]), 0.0)
+    return ti.max(tent, 1e-6)  # on the border of the only voxel there is, its value still counts
+
+
 @ti.kernel
 def query_points(
     # in:
@@ -85,12 +94,7 @@ def query_points(
                     s, ijk = nearest_voxel(x, reach, index)
                 if s >= 0:
                     t = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
-                    tent = 1.0
-                    if ti.static(blend):
-                        for d in ti.static(range(3)):
-                            tent *= ti.max(1.0 - 2.0 * ti.abs(t[d]), 0.0)
-                        # on the border of the only voxel there is, its value still counts
-                        tent = ti.max(tent, 1e-6)
+                    tent = tent_weight(t) if ti.static(blend) else 1.0
                     total += tent * decode(layout, s, t, latents, table, nodes)
                     weight += tent
                     covered += ti.cast(o < covering, ti.i32)

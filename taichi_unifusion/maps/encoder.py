@@ -192,9 +192,9 @@ def window_masks(margin: int) -> DeviceArray:
     return on_device
 
 
-def workers(runtime: Runtime) -> int:
-    """How many workers share the voxels of a frame."""
-    return CPU_WORKERS if runtime.device == "cpu" else GPU_WORKERS
+def workers(runtime: Runtime, on_gpu: int = GPU_WORKERS) -> int:
+    """How many workers share the voxels of a frame; `on_gpu` where each needs more scratch."""
+    return CPU_WORKERS if runtime.device == "cpu" else on_gpu
 
 
 def _tiles(runtime: Runtime, layout: Layout) -> ti.Field:

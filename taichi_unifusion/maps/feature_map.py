@@ -19,14 +19,14 @@ from ..runtime import DeviceArray
 from ..types import ImageView, PointCloud
 from .base_map import BaseMap, Integration, check_channels
 from .binner import Binner
-from .encoder import check_points, to_device, window_masks
+from .encoder import check_points, to_device, window_masks, workers
 from .encoding import position_encoding
 from .local_lim import Binned
 from .property_map import NEAREST_REACH
 from .settings import FeatureSettings
 from .voxel_grid import MASKS, WEIGHTS, VoxelData, VoxelField, VoxelGrid, latents
 
-CPU_WORKERS, GPU_WORKERS = 64, 1024
+GPU_WORKERS = 1024
 NODES = 17  # of the table of position features along an edge of the doubled voxel
 MAX_FEATURE = 1e4  # above it half precision, which ends at 65,504, would lose sums
 TEXTS_AT_ONCE = 64
@@ -103,7 +103,7 @@ class FeatureMap(BaseMap[FeatureSettings]):
     def _borrow_scratch(self) -> kernels.Scratch:
         """Scratch of the workers, one for all maps of a runtime."""
         live, q, entries = self.grid.runtime, self.rank, kernels.ENTRIES
-        n = CPU_WORKERS if live.device == "cpu" else GPU_WORKERS
+        n = workers(live, GPU_WORKERS)
         room = _whole(self.channels, kernels.CHANNELS)
 
         def make() -> kernels.Scratch:

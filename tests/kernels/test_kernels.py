@@ -146,10 +146,10 @@ def test_a_kernel_writes_what_its_signature_says_and_nothing_else(name):
 
 def test_the_rules_see_what_a_function_writes_for_its_caller():
     """`touch` writes the index, and so does every kernel that calls it."""
-    index, regression = (
-        functions(PACKAGE / "kernels" / f"{n}.py") for n in ("index", "regression")
+    index, regression, gram = (
+        functions(PACKAGE / "kernels" / f"{n}.py") for n in ("index", "regression", "gram")
     )
     assert (
         written(index["touch"]) == {"index", "keys", "counters"} <= written(index["touch_points"])
     )
-    assert "tiles" in written(regression["flush"]) and "G" in written(regression["add_tile"])
+    assert "tiles" in written(regression["flush"]) and "G" in written(gram["add_tile"])

@@ -95,20 +95,13 @@ def test_fuse_information_equals_its_twin(centered):
     )
     masks = rng.integers(0, 2**32, (voxels, 2), dtype=np.uint32)
     assert sums.shape == (voxels, q)
-    arrays = map_sums, map_weights, map_masks, map_latents
-    fusion.fuse_information(
-        layout,
-        0,
-        channels,
-        voxels,
-        slots,
-        sums[:, :, None],
-        weights,
-        masks,
-        1.0,
-        0.3,
-        *arrays,
-    )
+
+    def fuse(sign: float) -> None:
+        local = slots, sums[:, :, None], weights, masks
+        arrays = map_sums, map_weights, map_masks, map_latents
+        fusion.fuse_information(layout, 0, channels, voxels, *local, sign, 0.3, *arrays)
+
+    fuse(1.0)
     for n in range(voxels):
         if slots[n] >= 0:
             F, w = twin.fuse_information([old[n], new[n]], [int(known[n]), 1], 0.3)
@@ -120,19 +113,7 @@ def test_fuse_information_equals_its_twin(centered):
                 and map_weights[n] == old[n].w * known[n]
                 and not map_masks[n].any()
             )
-    fusion.fuse_information(
-        layout,
-        0,
-        channels,
-        voxels,
-        slots,
-        sums[:, :, None],
-        weights,
-        masks,
-        -1.0,
-        0.3,
-        *arrays,
-    )
+    fuse(-1.0)
     for n in np.flatnonzero(slots >= 0):
         assert map_weights[n] == old[n].w * known[n]
         if known[n]:
