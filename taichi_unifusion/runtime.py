@@ -22,7 +22,13 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakSet
 
-from .errors import CapacityError, MissingDependency, RuntimeStateError, check_choice
+from .errors import (
+    CapacityError,
+    InputError,
+    MissingDependency,
+    RuntimeStateError,
+    check_choice,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -33,6 +39,9 @@ DEVICES = ("auto", "cuda", "cpu")
 STALE_LOCK = 60  # [s] Taichi locks its cache of compiled kernels for a second or two
 MAX_TREES = 12
 PROBE_SECONDS = 20.0  # a driver that has not answered by then is taken for broken
+GIB = 1 << 30
+# CUDA's pool for sparse voxels: this share of the GPU's memory within limits, and where that is not known
+POOL_SHARE, POOL_LIMITS, POOL_UNKNOWN = 0.25, (1 * GIB, 8 * GIB), 2 * GIB
 
 
 def grown(room: int, needed: int) -> int:
@@ -84,10 +93,13 @@ class Arena:
 
 
 class Runtime:
-    """A started Taichi: `device` is "cuda" or "cpu", `description` names it for people."""
+    """A started Taichi: `device` is "cuda" or "cpu", `description` names it for people.
 
-    def __init__(self, device: str, description: str) -> None:
-        self.device, self.description = device, description
+    `sparse_pool` is the size in bytes of the pool that the indices of all maps share on CUDA.
+    """
+
+    def __init__(self, device: str, description: str, sparse_pool: int = 0) -> None:
+        self.device, self.description, self.sparse_pool = device, description, sparse_pool
         self.arena = Arena()
         self.warm = (
             False  # whether a pipeline has begun with a frame, for which kernels are compiled
@@ -116,15 +128,16 @@ def init(
     device: str = "auto",
     *,
     threads: int | None = None,
-    device_memory_gb: float = 2.0,
+    device_memory_gb: float | None = None,
     debug: bool = False,
 ) -> Runtime:
     """Start Taichi on CUDA if there is one, else on the CPU, and say which; a second call with the
     same device does nothing.
 
-    `threads` caps the CPU threads, `device_memory_gb` is CUDA's fixed pool for sparse voxels,
-    `debug` checks array bounds. Raises InputError for an unknown device, RuntimeStateError where
-    CUDA is asked for and absent, or another device is live.
+    `threads` caps the CPU threads, `device_memory_gb` is CUDA's fixed pool for sparse voxels [GiB]
+    (a quarter of the GPU's memory, 1 to 8), `debug` checks array bounds. Raises InputError for an
+    unknown device and a pool larger than the GPU, RuntimeStateError where CUDA is asked for and
+    absent, or another device is live.
     """
     global _runtime
     check_choice("device", device, DEVICES)
@@ -150,13 +163,14 @@ def init(
     }
     if threads:
         options["cpu_max_num_threads"] = threads
-    trouble = "" if device == "cpu" else _cuda_trouble()
+    trouble, memory = ("", 0) if device == "cpu" else _probe_cuda()
     if device == "cuda" and trouble:
         raise RuntimeStateError(f"device: CUDA was asked for but {trouble}; or use device 'cpu'")
     # never ti.gpu: Vulkan has no pointer SNodes
     wanted = ti.cpu if device == "cpu" or trouble else ti.cuda
     with redirect_stdout(StringIO()):  # what we run on is said by us, where people look for it
-        ti.init(arch=wanted, device_memory_GB=device_memory_gb, **options)
+        pool = _sparse_pool(device_memory_gb, memory)
+        ti.init(arch=wanted, device_memory_GB=pool / GIB, **options)
     found = "cuda" if ti.lang.impl.current_cfg().arch == ti.cuda else "cpu"
     if device == "cuda" and found != "cuda":
         raise RuntimeStateError(
@@ -165,7 +179,7 @@ def init(
         )
     if trouble and trouble != NO_DRIVER:  # there is a GPU, which somebody might want to use
         logger.warning("CUDA is not used: %s", trouble)
-    _runtime = Runtime(found, _describe(found, threads))
+    _runtime = Runtime(found, _describe(found, threads), pool if found == "cuda" else 0)
     name = "Taichi" if ti.__name__ == "taichi" else ti.__name__
     _say(f"{name} {'.'.join(map(str, ti.__version__))} on {_runtime.description}")
     return _runtime
@@ -253,38 +267,64 @@ def import_taichi() -> Any:
 
 
 NO_DRIVER = "there is no NVIDIA driver (libcuda.so.1); install one"
-# Starts the driver and counts its devices, as Taichi would.
+# Starts the driver, counts its devices as Taichi would, and prints the bytes of the one that it takes.
 _PROBE = """
 import ctypes
-driver, count = ctypes.CDLL("libcuda.so.1"), ctypes.c_int()
-raise SystemExit(driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)) or not count.value)
+driver = ctypes.CDLL("libcuda.so.1")
+count, device, total = ctypes.c_int(), ctypes.c_int(), ctypes.c_size_t()
+failed = driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)) or not count.value
+if not failed and not driver.cuDeviceGet(ctypes.byref(device), 0):
+    driver.cuDeviceTotalMem_v2(ctypes.byref(total), device)
+print(total.value)
+raise SystemExit(bool(failed))
 """
 
 
-def _cuda_trouble() -> str:
-    """Why CUDA cannot be used, as a clause that says what to do; "" where nothing speaks against it.
+def _probe_cuda() -> tuple[str, int]:
+    """Why CUDA cannot be used, as a clause that says what to do, "" where nothing speaks against
+    it; and the GPU's memory in bytes, 0 where it is not known.
 
     A broken driver can hang whoever starts it, so a process of its own tries it first.
     """
     try:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
-        return NO_DRIVER
+        return NO_DRIVER, 0
     try:
         ctypes.CDLL("libcuda.so")  # the name that Taichi opens
     except OSError:
-        return "Taichi needs libcuda.so; make a link of that name to libcuda.so.1"
+        return "Taichi needs libcuda.so; make a link of that name to libcuda.so.1", 0
     try:
         done = subprocess.run(
-            [sys.executable, "-c", _PROBE], timeout=PROBE_SECONDS, capture_output=True, check=False
+            [sys.executable, "-c", _PROBE],
+            timeout=PROBE_SECONDS,
+            capture_output=True,
+            text=True,
+            check=False,
         )
     except subprocess.TimeoutExpired:
-        return (
+        trouble = (
             f"the NVIDIA driver did not answer in {PROBE_SECONDS:.0f} s; check it with nvidia-smi"
         )
+        return trouble, 0
     if done.returncode:
-        return "the NVIDIA driver finds no device that works; check it with nvidia-smi"
-    return ""
+        return "the NVIDIA driver finds no device that works; check it with nvidia-smi", 0
+    return "", int(done.stdout)
+
+
+def _sparse_pool(asked_gb: float | None, memory: int) -> int:
+    """Bytes of CUDA's pool for sparse voxels on a GPU of `memory` bytes, 0 where that is not known.
+
+    Raises InputError for more than the GPU has: Taichi would end the process.
+    """
+    if asked_gb is None:
+        low, high = POOL_LIMITS
+        return int(min(max(POOL_SHARE * memory, low), high)) if memory else POOL_UNKNOWN
+    if memory and asked_gb * GIB > memory:
+        raise InputError(
+            f"device_memory_gb: {asked_gb:g} is more than the {memory / GIB:.1f} GiB of the GPU"
+        )
+    return int(asked_gb * GIB)
 
 
 def _describe(device: str, threads: int | None) -> str:

@@ -31,7 +31,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def runtime():
-    """The one Taichi of the process, on the CPU unless UNIFUSION_DEVICE says otherwise."""
+    """The one Taichi of the process, on the CPU unless UNIFUSION_TEST_DEVICE says otherwise."""
     return uf.init(DEVICE)
 
 

@@ -10,6 +10,7 @@ import pytest
 import taichi as ti
 
 from taichi_unifusion import runtime
+from taichi_unifusion.errors import InputError
 
 
 @pytest.mark.parametrize(("age", "stays"), [(1, True), (3600, False)])
@@ -47,12 +48,26 @@ def test_a_driver_that_cannot_be_used_is_found_out_without_starting_it(
     def run(command, timeout, **_):
         if answer == "never":
             raise subprocess.TimeoutExpired(command, timeout)
-        return subprocess.CompletedProcess(command, answer)
+        return subprocess.CompletedProcess(command, answer, stdout=f"{8 * runtime.GIB}\n")
 
     monkeypatch.setattr(runtime.ctypes, "CDLL", load)
     monkeypatch.setattr(runtime.subprocess, "run", run)
-    found = runtime._cuda_trouble()
+    found, memory = runtime._probe_cuda()
     assert said in found and bool(found) == bool(said)
+    assert memory == (0 if said else 8 * runtime.GIB)
+
+
+@pytest.mark.parametrize(
+    ("memory_gb", "asked_gb", "pool_gb"),
+    [(0, None, 2), (2, None, 1), (24, None, 6), (140, None, 8), (24, 20, 20), (0, 20, 20)],
+)
+def test_the_pool_for_voxels_follows_the_gpu(memory_gb, asked_gb, pool_gb):
+    assert runtime._sparse_pool(asked_gb, memory_gb * runtime.GIB) == pool_gb * runtime.GIB
+
+
+def test_a_pool_larger_than_the_gpu_is_refused():
+    with pytest.raises(InputError, match="16 is more than the 8.0 GiB of the GPU"):
+        runtime._sparse_pool(16, 8 * runtime.GIB)
 
 
 def test_another_taichi_that_is_not_there_is_named(tmp_path):

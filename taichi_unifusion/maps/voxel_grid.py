@@ -30,6 +30,12 @@ SPARSE_LIMIT, SPARSE_POOL = 1 << 30, 1_450_000_000
 BYTES_PER_TREE = 80_000_000  # what an empty index tree takes of the pool
 # a 4^3 leaf with three i32 fields and its share of the nodes above it
 BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16
+# On CUDA one pool of fixed size serves all trees, and running over it ends CUDA for the process. It is
+# taken in chunks of 16,384 nodes: a tree begins with a chunk a level, and with lists; at worst every
+# leaf has three nodes of its own above it. Kept free: what the runtime takes, and four chunks, since
+# the voxels of a frame are there before they are counted.
+CUDA_TREE, CUDA_CHUNK, CUDA_RESERVE = 90_000_000, 66_000_000, 330_000_000
+NODES_PER_CHUNK = 16_384
 FIRST_CAPACITY = 4096
 
 KEYS = VoxelField("keys", np.dtype(np.int32), (3,))
@@ -116,8 +122,8 @@ class VoxelGrid:
         return self._pools["keys"].capacity
 
     def _borrow_tree(self) -> kernels.Index:
-        """An empty index tree: one that a map no longer uses, else a new one. Taichi never frees
-        the memory of a tree, and on CUDA one that was emptied is not safe to fill again.
+        """An empty index tree: one that a map no longer uses, else a new one, because Taichi never
+        frees the memory of a tree. Raises CapacityError where another one would not be safe.
         """
         free = self.runtime.free_trees
         if not free and self.runtime.trees >= runtime.MAX_TREES:
@@ -126,12 +132,21 @@ class VoxelGrid:
             # one of an equal map, for which kernels are compiled already, if there is one
             alike = [place for place, (fields, _) in enumerate(free) if fields == self.fields]
             _, tree = free.pop(alike[-1] if alike else -1)
-            tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
+            if self.runtime.device == "cpu":
+                tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
+            else:  # there nodes that were given back are not safe to fill again (taichi#6401)
+                tree.slot.fill(0)
+                tree.stamp.fill(0)
         else:
             self.runtime.count_tree()
+            if _index_bytes(self.runtime) > _index_room(self.runtime):
+                self.runtime.trees -= 1
+                raise CapacityError(
+                    "the index of another map would not fit into the device memory that is kept for "
+                    "indices: delete or save maps, or give uf.init a larger device_memory_gb"
+                )
             tree = _build_tree()
-        if self.runtime.device == "cpu":
-            weakref.finalize(self, free.append, (self.fields, tree))
+        weakref.finalize(self, free.append, (self.fields, tree))
         return tree
 
     def next_frame(self) -> int:
@@ -159,8 +174,9 @@ class VoxelGrid:
         if self._together_too_large():
             raise CapacityError(
                 f"the indices of all maps of this process, {len(self.runtime.grids)} now and those "
-                f"before, would pass {SPARSE_POOL / 1e9:.2f} GB, where Taichi is no longer safe: use "
-                "larger voxels or fewer maps, or save the maps and go on in a new process"
+                f"before, would pass {_index_room(self.runtime) / 1e9:.2f} GB, where Taichi is no "
+                "longer safe: use larger voxels or fewer maps, or save the maps and go on in a new "
+                "process; on CUDA also with a larger device_memory_gb for uf.init"
             )
 
     def recount(self) -> None:
@@ -176,8 +192,7 @@ class VoxelGrid:
         return (self._leaves + self._touched) * BYTES_PER_LEAF > SPARSE_LIMIT
 
     def _together_too_large(self) -> bool:
-        leaves = sum(self.runtime.leaves.values())
-        return self.runtime.trees * BYTES_PER_TREE + leaves * BYTES_PER_LEAF > SPARSE_POOL
+        return _index_bytes(self.runtime) > _index_room(self.runtime)
 
     def reserve(self, extra: int) -> None:
         """Make room for `extra` more voxels; raises CapacityError before sparse memory becomes
@@ -288,6 +303,19 @@ class VoxelGrid:
         leaves = int(kernels.count_leaves(self.index)) if self.count else 0
         row = sum(field.bytes for field in (KEYS, *self.fields))
         return self.count * row + leaves * BYTES_PER_LEAF
+
+
+def _index_bytes(live: runtime.Runtime) -> int:
+    """Bytes of sparse nodes that the index trees of all maps take, at most."""
+    leaves = live.leaves.values()
+    if live.device == "cpu":
+        return live.trees * BYTES_PER_TREE + sum(leaves) * BYTES_PER_LEAF
+    return live.trees * CUDA_TREE + sum(n // NODES_PER_CHUNK for n in leaves) * CUDA_CHUNK
+
+
+def _index_room(live: runtime.Runtime) -> int:
+    """Bytes of sparse nodes that are safe."""
+    return SPARSE_POOL if live.device == "cpu" else live.sparse_pool - CUDA_RESERVE
 
 
 def _build_tree() -> kernels.Index:

@@ -7,6 +7,7 @@ import gc
 import numpy as np
 import pytest
 import reference
+from places import DEVICE
 from scenes import moved, rough
 
 from taichi_unifusion import runtime
@@ -171,6 +172,7 @@ def test_an_index_that_would_pass_safe_memory_is_refused(monkeypatch):
     assert grid.count == len(keys)
 
 
+@pytest.mark.skipif(DEVICE != "cpu", reason="the CPU's pool; that of a GPU has a test of its own")
 def test_the_indices_of_all_maps_count_together(monkeypatch):
     """Each map alone is within its limit; what is touched again and again counts once."""
     gc.collect()
@@ -194,6 +196,64 @@ def test_the_indices_of_all_maps_count_together(monkeypatch):
             for grid in grids:
                 integrate(grid, part)
     assert min(map(len, grids)) > 1000
+
+
+@pytest.fixture
+def like_cuda(monkeypatch):
+    """The live runtime as on a GPU: a pool of fixed size, and nodes that are never given back."""
+    gc.collect()
+    live = runtime.current()
+    monkeypatch.setattr(live, "device", "cuda")
+    monkeypatch.setattr(live, "sparse_pool", 1 << 40)
+    return live
+
+
+def test_the_pool_of_a_gpu_is_not_run_over(like_cuda, monkeypatch):
+    """It is counted by whole chunks, and keeps room for what a frame adds before it is counted."""
+    monkeypatch.setattr(like_cuda, "leaves", {})
+    grid, rng = a_grid(), np.random.default_rng(21)  # other places than those of tests before
+    grid.recount()  # a tree that was used before keeps its nodes
+    monkeypatch.setattr(voxel_grid, "NODES_PER_CHUNK", 1000)
+    chunks = sum(n // 1000 for n in like_cuda.leaves.values()) + 3
+    pool = like_cuda.trees * voxel_grid.CUDA_TREE + chunks * voxel_grid.CUDA_CHUNK
+    monkeypatch.setattr(like_cuda, "sparse_pool", pool + voxel_grid.CUDA_RESERVE)
+
+    def integrate(grid):
+        keys = touch(grid, rng.uniform(-200, 200, (500, 3)).astype(np.float32))
+        ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
+        grid.claim(len(keys), keys, ones, slots)
+
+    with pytest.raises(CapacityError, match="larger device_memory_gb for uf.init"):
+        for _ in range(9):
+            integrate(grid)
+    assert 2000 <= len(grid) <= 4000
+
+
+def test_a_map_whose_index_does_not_fit_the_pool_of_a_gpu_is_refused(like_cuda, monkeypatch):
+    free = [a_grid() for _ in range(max(len(like_cuda.free_trees), 1))]
+    trees = like_cuda.trees
+    monkeypatch.setattr(runtime, "MAX_TREES", trees + 1)
+    monkeypatch.setattr(like_cuda, "sparse_pool", voxel_grid.CUDA_RESERVE)
+    with pytest.raises(CapacityError, match="index of another map would not fit"):
+        a_grid()
+    assert like_cuda.trees == trees and free
+
+
+def test_a_tree_is_used_again_on_a_gpu_without_giving_nodes_back(like_cuda, cloud):
+    """Voxels, numbers and stamps of the map before are gone; its nodes stay."""
+    gc.collect()
+    grid = a_grid()
+    for _ in range(3):  # frame stamps that a new map gives again
+        keys = touch(grid, cloud.points)
+    slots, ones = np.empty(len(keys), np.int32), np.ones(len(keys), np.float32)
+    grid.claim(len(keys), keys, ones, slots)
+    index, leaves = grid.index, kernels.count_leaves(grid.index)
+    del grid
+    again = a_grid()
+    assert again.index is index and kernels.count_leaves(index) == leaves
+    assert again.find(len(keys), keys, ones, slots) == 0
+    near = rough(1, 500).points
+    assert set(map(tuple, touch(again, near).tolist())) == reference.touch_points(in_voxels(near))
 
 
 def test_lone_points_that_make_no_voxel_also_count_against_safe_memory(monkeypatch):

@@ -6,5 +6,5 @@ import os
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-DEVICE = os.environ.get("UNIFUSION_DEVICE", "cpu")
+DEVICE = os.environ.get("UNIFUSION_TEST_DEVICE", "cpu")
 DATA = Path(os.environ.get("UNIFUSION_DATA", ROOT.parent / "shared" / "data"))
