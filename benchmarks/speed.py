@@ -1,180 +1,148 @@
-"""Time a frame by stage, beside Open3D's TSDF on the same frames in the same run.
+"""Time a frame and a mesh, beside Open3D's TSDF on the same frames in the same run.
 
-    python benchmarks/speed.py 7scenes PATH --end 300 --every 3
-    python benchmarks/speed.py synthetic --every 2
+    python benchmarks/speed.py 7scenes PATH --end 300 --every 1 3 10
+    python benchmarks/speed.py synthetic --window 1           # frame by frame
+    python benchmarks/speed.py 7scenes PATH --growth          # the 300th frame against the 30th
+    python benchmarks/speed.py 7scenes PATH --end 60 --every 3 --profile     # by kernel
 
-Ours: preprocess + surface map + colour map, with the defaults (5 cm and 2.5 cm voxels). Peer:
-`VoxelBlockGrid` with colour at 1 cm in blocks of 8, on the CPU. They take turns, ten frames each,
-so that a busy machine slows both; medians and their ratio are printed. Frames are loaded before the
-clock starts, and between turns all threads come to rest (OpenMP's spin for a while when they have
-no work). `--growth` shows instead how the time a frame depends on the size of the map.
+Ours: surface and colour with the defaults (5 cm and 2.5 cm voxels) through `Pipeline.step`, and the
+same maps given cloud after cloud. Peer: `VoxelBlockGrid` with colour at 1 cm in blocks of 8, on the
+CPU. They take turns, ten frames each, so that a busy machine slows all; the first turn, in which
+kernels are compiled, does not count. Figures are means, by the clock on the wall and as processor
+time of all threads: work that a pipeline puts off to a later frame is in them, what is left at the
+end too. Frames are loaded before the clock starts. The mesh with colour is the mean of three.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import resource
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from speed_sides import ByHand, OpenTsdf, Ours, Side, Times, timed
+from speed_tables import HEADER, markdown, rows_of
 
 import taichi_unifusion as uf
-from taichi_unifusion import runtime
+from taichi_unifusion.config import MeshSettings
+from taichi_unifusion.errors import MissingDependency
 from taichi_unifusion.preprocessing import PreprocessSettings
 
-TURN, REST = 10, 0.5  # frames, seconds
+TURN, REST = 10, 0.5  # frames; seconds in which all threads come to rest
+MESHES = 3  # that count, after one that compiles
+WORST = 3.0  # goal: the worst frame, as a multiple of the mean
+VIEWS, ROUNDS = 20, 15  # of `--growth`
+GROWTH = 1.3  # goal: the last round against the second
 
 
-class Clock:
-    """Milliseconds by stage."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, list[float]] = {}
-
-    def run(self, stage: str, work, *args):
-        runtime.synchronize()
-        start = time.perf_counter()
-        result = work(*args)
-        runtime.synchronize()
-        self.laps.setdefault(stage, []).append(1e3 * (time.perf_counter() - start))
-        return result
-
-    def per_frame(self, *stages: str) -> np.ndarray:
-        return np.sum([self.laps[stage] for stage in stages], axis=0)
-
-
-class Ours:
-    """Preprocess, surface and colour with the defaults."""
-
-    stages = ("preprocess", "surface", "color")
-
-    def __init__(self, clock: Clock, depth_max: float) -> None:
-        self.clock = clock
-        self.settings, defaults = PreprocessSettings(depth_max=depth_max), uf.Config()
-        self.surface, self.color = (
-            uf.SurfaceMap(defaults.surface),
-            uf.PropertyMap("color", 3, defaults.color),
+def measure(sides: Sequence[Side], frames: Sequence[uf.Frame]) -> dict[str, Times]:
+    """Times by side; raises InputError where there are not more frames than the first turn has."""
+    if len(frames) <= TURN:
+        raise uf.errors.InputError(
+            f"{len(frames)} frames: more than {TURN} are needed, since the first {TURN} do not count"
         )
-
-    def integrate(self, frame: uf.Frame) -> None:
-        cloud = self.clock.run(
-            "preprocess",
-            lambda: uf.preprocess(frame, self.settings).transformed(frame.T_world_camera),
-        )
-        self.clock.run("surface", self.surface.integrate, cloud)
-        self.clock.run("color", self.color.integrate, cloud)
-
-    def mesh(self) -> uf.Mesh:
-        mesh = self.clock.run("mesh", self.surface.extract_mesh, 4)
-        return mesh.with_attribute(
-            "color", self.clock.run("mesh color", self.color.query, mesh.vertices)
-        )
-
-
-class OpenTsdf:
-    """Open3D's VoxelBlockGrid with colour, 1 cm voxels, blocks of 8."""
-
-    def __init__(self, clock: Clock, depth_max: float) -> None:
-        import open3d as o3d
-
-        self.o3d, self.clock, self.depth_max = o3d, clock, depth_max
-        core = o3d.core
-        self.grid = o3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight", "color"),
-            (core.float32, core.float32, core.float32),
-            ((1,), (1,), (3,)),
-            0.01,
-            8,
-            50000,
-            core.Device("CPU:0"),
-        )
-
-    def integrate(self, frame: uf.Frame) -> None:
-        geometry, core = self.o3d.t.geometry, self.o3d.core
-        depth, color = (
-            geometry.Image(frame.depth),
-            geometry.Image(frame.color.astype(np.float32) / 255),
-        )
-        K, T = core.Tensor(frame.camera.matrix), core.Tensor(np.linalg.inv(frame.T_world_camera))
-
-        def step() -> None:
-            blocks = self.grid.compute_unique_block_coordinates(depth, K, T, 1.0, self.depth_max)
-            self.grid.integrate(blocks, depth, color, K, T, 1.0, self.depth_max)
-
-        self.clock.run("open3d", step)
-
-    def mesh(self):
-        return self.clock.run("open3d mesh", self.grid.extract_triangle_mesh)
+    laps: dict[str, list] = {side.name: [] for side in sides}
+    for first in range(0, len(frames), TURN):
+        for side in sides:
+            time.sleep(REST)
+            for frame in frames[first : first + TURN]:
+                laps[side.name].append(timed(side.step, side.prepare(frame)))
+            if first == 0:  # or frames that count would do work of those that do not
+                side.finish()
+    finish = {side.name: timed(side.finish) for side in sides}
+    meshes: dict[str, list] = {side.name: [] for side in sides}
+    for side in [*sides] * (1 + MESHES):
+        time.sleep(REST)
+        meshes[side.name].append(timed(side.mesh))
+    return {
+        name: Times(np.array(laps[name][TURN:]), finish[name], np.mean(meshes[name][1:], axis=0))
+        for name in laps
+    }
 
 
-def growth(frames, depth_max: float) -> None:
-    """Time a frame at the 30th and the 300th frame: the same view, revisited while the map grows
-    elsewhere.
-    """
-    clock = Clock()
-    ours = Ours(clock, depth_max)
-    for n in range(300):
-        frame = frames[n % len(frames)]
-        shift = np.eye(4)
-        # the scene again, beside itself: equal views, a map that grows
-        shift[0, 3] = 10.0 * (n // len(frames))
-        ours.integrate(
-            uf.Frame(frame.depth, frame.camera, frame.color, shift @ frame.T_world_camera)
-        )
-    total = clock.per_frame(*ours.stages)
-    early, late = np.median(total[20:40]), np.median(total[280:300])
+def compare(dataset: uf.Dataset, samplings: Sequence[int], config: uf.Config) -> None:
+    """Print the table of all samplings, and what the worst frame and memory came to."""
+    rows, worst, lacking = [], [], ""
+    for every in samplings:
+        sides: list[Side] = [Ours(config), ByHand(config)]
+        try:
+            sides.append(OpenTsdf(config))
+        except MissingDependency as error:
+            lacking = f"; without a peer: {error}"
+        frames = list(dataset[::every])
+        times = measure(sides, frames)
+        rows += rows_of(every, times)
+        worst.append(times[Ours.name].worst)
+    print(markdown(HEADER, rows))
+    wall, cpu = np.max(worst, axis=0)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(
-        f"frame 20-39: {early:.1f} ms, frame 280-299: {late:.1f} ms, ratio {late / early:.2f}; "
-        f"{len(ours.surface):,} surface voxels, {len(ours.color):,} colour voxels"
+        f"\nworst frame / mean at most {wall:.1f} by the clock and {cpu:.1f} of the processors (goal "
+        f"{WORST:g}); peak memory of all sides and the frames {memory:.2f} GB{lacking}"
     )
 
 
-def main() -> None:
+def grow(views: Sequence[uf.Frame], config: uf.Config, rounds: int = ROUNDS) -> None:
+    """Print the time a frame by round: the same views in every round, while the map grows
+    elsewhere.
+    """
+    ours, laps = Ours(config), []
+    for n in range(rounds):
+        shift = np.eye(4)
+        shift[0, 3] = 10.0 * n  # the scene again, beside itself
+        for view in views:
+            frame = replace(view, T_world_camera=shift @ view.T_world_camera)
+            laps.append(timed(ours.step, frame))
+    means = np.array(laps).reshape(rounds, len(views), 2).mean(axis=1)
+    size = len(views)
+    rows = [
+        [f"{size * n} to {size * (n + 1) - 1}", f"{wall:.1f}", f"{cpu:.1f}"]
+        for n, (wall, cpu) in enumerate(means)
+    ]
+    print(markdown(("frames", "wall [ms]", "CPU [ms]"), rows))
+    wall, cpu = means[-1] / means[1]
+    sizes = {name: len(each) for name, each in ours.pipeline.maps.items()}
+    print(
+        f"\nlast round / second: {wall:.2f} by the clock, {cpu:.2f} of the processors (goal {GROWTH:g}); "
+        f"{', '.join(f'{count:,} voxels of {name}' for name, count in sizes.items())}"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("format")
     parser.add_argument("path", nargs="?")
-    parser.add_argument("--end", type=int)
-    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--end", type=int, help="leave out the frames from this one on")
+    parser.add_argument("--every", type=int, nargs="+", default=[1], help="a row for each")
+    parser.add_argument("--window", type=int, help="frames that are fused at once (Config.window)")
     parser.add_argument("--depth-max", type=float, default=5.0)
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--growth", action="store_true")
-    options = parser.parse_args()
-    live = uf.init(options.device)
-    frames = list(uf.open_dataset(options.format, options.path)[: options.end : options.every])
-    if options.growth:
-        growth(frames[:20], options.depth_max)
-        return
-    clock = Clock()
-    ours, peer = Ours(clock, options.depth_max), OpenTsdf(clock, options.depth_max)
-    for turn in range(0, len(frames), TURN):
-        for side in (ours, peer):
-            time.sleep(REST)
-            for frame in frames[turn : turn + TURN]:
-                side.integrate(frame)
-    for side in (ours, peer) * 3:
-        time.sleep(REST)
-        side.mesh()
-
-    table = Table(title=f"{len(frames)} frames of {options.format}, {live.description}")
-    for column in ("stage", "median ms", "mean ms", "first ms"):
-        table.add_column(column, justify="left" if column == "stage" else "right")
-    for stage, laps in clock.laps.items():
-        table.add_row(
-            stage, *(f"{value:.1f}" for value in (np.median(laps[1:]), np.mean(laps[1:]), laps[0]))
-        )
-    Console().print(table)
-    total = clock.per_frame(*ours.stages)[2:]
-    tsdf = np.array(clock.laps["open3d"])[2:]
-    print(
-        f"ours {np.median(total):.1f} ms a frame, Open3D {np.median(tsdf):.1f} ms a frame, "
-        f"ratio {np.median(total) / np.median(tsdf):.2f} (fastest frames {total.min():.1f} and {tsdf.min():.1f}, "
-        f"ratio {total.min() / tsdf.min():.2f}); peak memory of both "
-        f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GB"
+    parser.add_argument("--growth", action="store_true", help="time by the size of the map")
+    parser.add_argument("--profile", action="store_true", help="time by kernel")
+    options = parser.parse_args(arguments)
+    config = uf.Config(
+        preprocess=PreprocessSettings(depth_max=options.depth_max), mesh=MeshSettings(min_area=0.0)
     )
+    if options.window is not None:
+        config = replace(config, window=options.window)
+    if options.profile:
+        os.environ["TI_KERNEL_PROFILER"] = "1"  # read when Taichi starts
+    live = uf.init(options.device)
+    dataset = uf.open_dataset(options.format, options.path)[: options.end]
+    print(f"{options.format}, {live.description}")
+    if options.growth:
+        grow(list(dataset[: VIEWS * options.every[0] : options.every[0]]), config)
+    elif options.profile:
+        from speed_profile import profile
+
+        print(profile(list(dataset[:: options.every[0]]), config, TURN))
+    else:
+        compare(dataset, options.every, config)
 
 
 if __name__ == "__main__":
