@@ -65,15 +65,9 @@ def measure(sides: Sequence[Side], frames: Sequence[uf.Frame]) -> dict[str, Time
 
 def compare(dataset: uf.Dataset, samplings: Sequence[int], config: uf.Config) -> None:
     """Print the table of all samplings, and what the worst frame and memory came to."""
-    rows, worst, lacking = [], [], ""
+    rows, worst = [], []
     for every in samplings:
-        sides: list[Side] = [Ours(config), ByHand(config)]
-        try:
-            sides.append(OpenTsdf(config))
-        except MissingDependency as error:
-            lacking = f"; without a peer: {error}"
-        frames = list(dataset[::every])
-        times = measure(sides, frames)
+        times = measure(all_sides(config), list(dataset[::every]))
         rows += rows_of(every, times)
         worst.append(times[Ours.name].worst)
     print(markdown(HEADER, rows))
@@ -81,8 +75,18 @@ def compare(dataset: uf.Dataset, samplings: Sequence[int], config: uf.Config) ->
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(
         f"\nworst frame / mean at most {wall:.1f} by the clock and {cpu:.1f} of the processors (goal "
-        f"{WORST:g}); peak memory of all sides and the frames {memory:.2f} GB{lacking}"
+        f"{WORST:g}); peak memory of all sides and the frames {memory:.2f} GB"
     )
+
+
+def all_sides(config: uf.Config) -> list[Side]:
+    """New maps of every side; a peer that is not installed is left out, and that is said."""
+    sides: list[Side] = [Ours(config), ByHand(config)]
+    try:
+        sides.append(OpenTsdf(config))
+    except MissingDependency as error:
+        print(f"without a peer: {error}")
+    return sides
 
 
 def grow(views: Sequence[uf.Frame], config: uf.Config, rounds: int = ROUNDS) -> None:

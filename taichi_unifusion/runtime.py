@@ -109,6 +109,7 @@ class Runtime:
         self.free_trees: list[tuple[Any, Any]] = []
         self.grids: WeakSet[Any] = WeakSet()  # of the maps that live
         self.leaves: dict[Any, int] = {}  # index tree -> leaves that it ever had, at most
+        self.earlier: dict[Any, int] = {}  # those that it had for maps that are gone
 
     def count_tree(self) -> None:
         """Note that one more index tree is made; raises CapacityError before there are more than

@@ -4,27 +4,37 @@ pictures of what is worst.
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from places import DEVICE
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
+import gpu_checks  # noqa: E402
 import house  # noqa: E402
 import properties_flicker  # noqa: E402
 import quality  # noqa: E402
 import quality_pictures  # noqa: E402
+import speed  # noqa: E402
+import speed_profile  # noqa: E402
+import speed_tables  # noqa: E402
 import tracking  # noqa: E402
 from quality_methods import METHODS, method  # noqa: E402
 from quality_scenes import split  # noqa: E402
+from speed_sides import ByHand, OpenTsdf, Ours, Times  # noqa: E402
 
-from taichi_unifusion import Frame, PinholeCamera  # noqa: E402
+from taichi_unifusion import Config, Frame, PinholeCamera  # noqa: E402
 from taichi_unifusion.datasets.synthetic import SyntheticRoom  # noqa: E402
-from taichi_unifusion.errors import InputError  # noqa: E402
+from taichi_unifusion.errors import InputError, RuntimeStateError  # noqa: E402
+from taichi_unifusion.kernels.layout import Layout  # noqa: E402
+from taichi_unifusion.maps.encoder import window_masks  # noqa: E402
 
 SMOOTH = 0.5  # share by which the motion may change from one frame to the next
 CLEARANCE = 0.35  # [m] of a camera centre to what it sees: no hand passes nearer
@@ -174,3 +184,144 @@ def test_the_table_of_trackers_has_a_row_a_method_and_tells_good_poses_from_bad_
     assert (
         float(tracking.agreement(pyramids, truth)) > float(tracking.agreement(pyramids, still)) + 20
     )
+
+
+@pytest.fixture(scope="module")
+def small_room() -> SyntheticRoom:
+    return SyntheticRoom(frames=60, width=160, height=120)
+
+
+def test_times_of_a_side_are_means_that_hold_what_was_put_off():
+    times = Times(np.array([[1.0, 2], [1, 2], [4, 2]]), np.array([6.0, 0]), np.array([5.0, 5]))
+    assert times.mean.tolist() == [4, 2] and times.worst.tolist() == [1, 1]
+
+
+def test_speed_has_a_row_a_side_and_sampling(small_room, monkeypatch, capsys):
+    monkeypatch.setattr(speed, "REST", 0)
+    monkeypatch.setattr(speed, "TURN", 4)
+    # one after the other, so that they share index trees, for which kernels are compiled
+    for side in (Ours, ByHand):
+        monkeypatch.setattr(speed, "all_sides", lambda config, side=side: [side(config)])
+        if side is ByHand:
+            monkeypatch.setattr(speed, "Ours", ByHand)
+        speed.compare(small_room[:12], [1, 2], Config())
+        rows = [
+            [cell.strip() for cell in line.strip("|").split("|")]
+            for line in capsys.readouterr().out.splitlines()
+            if line.startswith("|")
+        ][2:]
+        assert [row[:3] for row in rows] == [["1", "8", side.name], ["2", "2", side.name]]
+        assert all(float(row[3]) > 0 and float(row[7]) >= 1 for row in rows)
+    with pytest.raises(InputError, match="more than 4 are needed"):
+        speed.compare(small_room[:12], [3], Config())
+
+
+def test_ratios_are_to_the_peer():
+    one = Times(np.full((2, 2), 3.0), np.zeros(2), np.array([8.0, 4]))
+    peer = Times(np.full((2, 2), 2.0), np.zeros(2), np.array([4.0, 4]))
+    row, other = speed_tables.rows_of(5, {Ours.name: one, OpenTsdf.name: peer})
+    assert row[5:7] == ["1.50", "1.50"] and row[11:] == ["2.00", "1.00"]
+    assert other[5:7] == ["1.00", "1.00"]
+    assert speed_tables.rows_of(5, {Ours.name: one})[0][5:7] == ["-", "-"]
+
+
+def test_growth_compares_the_same_views_by_round(small_room, capsys):
+    speed.grow(list(small_room[:8:2]), Config(), rounds=3)
+    text = capsys.readouterr().out
+    assert "| 0 to 3 |" in text and "| 8 to 11 |" in text and "last round / second" in text
+
+
+def test_encoding_is_counted_as_what_every_voxel_sees(small_room):
+    """Bytes and operations that the profile sets beside the time are those of the samples."""
+    with speed_profile.counted_launches() as counted:
+        Ours(Config()).step(small_room[0])
+    assert counted.keys() == speed_profile.COUNTS.keys()
+    # of one map: 20 + 4 rows, in patches of 4 x 4
+    blocks, layout = 2, Layout(20, 1)
+    of = {
+        "layout": layout,
+        "blocks": blocks,
+        "masks": np.array([[0xFF, 0], [0, 1]], np.uint32),
+        "neighbors": np.where(np.arange(27) == 13, [[0], [1]], -1),
+        "totals": np.array([8, 1]),
+        "minimum": 2,
+        "window": window_masks(4),
+    }
+    of["neighbors"][0, 14] = 1
+    patches, samples = 1 + 2 + 3 + 4 + 5 + 5, 8 + 1
+    solve = 20**3 / 3 + 20**2 * (4 + 2)
+    assert speed_profile.COUNTS["encode_cells"].of(of)[1] == 32 * patches * samples + solve
+
+
+def test_profile_runs_the_frames_and_says_how_it_counts(small_room, monkeypatch):
+    # of a process that Taichi was started in with its profiler on
+    monkeypatch.setattr(speed_profile, "kernel_times", lambda: {"vote_cells": (6.0, 2)})
+    text = speed_profile.profile(list(small_room[:4]), Config(), 2)
+    assert "2 frames, Pipeline.step" in text and "| vote_cells | 3.00 | 1.0 | " in text
+    assert "| vote_cells | 3.00 | 1.0 | - |" not in text
+    assert all(f"| {name} | {count.how} |" in text for name, count in speed_profile.COUNTS.items())
+
+
+def test_profile_sets_the_least_time_beside_a_kernels():
+    machine = speed_profile.Machine(bytes_per_ms=1e6, flops_per_ms=1e7)
+    times = {"encode_cells": (40.0, 4), "fuse": (10.0, 2), "tiny": (0.01, 2)}
+    text = speed_profile.kernel_table(times, {"encode_cells": [(2e6, 1e6)] * 4}, machine, 2)
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:]]
+    assert rows[0] == ["encode_cells", "20.00", "2.0", "4.0", "2.0", "4.00", "5"]
+    assert rows[1] == ["fuse", "5.00", "1.0", "-", "-", "-", "-"]
+    assert [row[:2] for row in rows[2:]] == [["others", "0.01"], ["all kernels", "25.00"]]
+
+
+def test_kernels_are_timed_by_name_over_all_their_forms():
+    code = """
+import taichi_unifusion as uf, speed_profile
+from taichi_unifusion.datasets.synthetic import SyntheticRoom
+uf.init("cpu")
+frame = SyntheticRoom(60, width=160, height=120)[0]
+uf.preprocess(frame)
+uf.preprocess(frame)
+ms, calls = speed_profile.kernel_times()["estimate_normals"]
+print(calls, ms > 0)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"TI_KERNEL_PROFILER": "1", "PYTHONPATH": str(BENCHMARKS)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == ["2", "True"]
+
+
+def test_tables_align_numbers():
+    assert speed_tables.markdown(["a", "b"], [["x", "1.5"], ["y", "-"]]).splitlines() == [
+        "| a | b |",
+        "| --- | ---: |",
+        "| x | 1.5 |",
+        "| y | - |",
+    ]
+
+
+def test_a_machine_without_cuda_is_told_so_in_a_sentence(monkeypatch, capsys):
+    def absent(device: str) -> None:
+        raise RuntimeStateError(f"device: {device} was asked for but is not there")
+
+    monkeypatch.setattr(gpu_checks.uf, "init", absent)
+    monkeypatch.setattr(sys, "argv", ["gpu_checks.py", "cuda"])
+    assert gpu_checks.main() == 2
+    assert capsys.readouterr().out == "device: cuda was asked for but is not there\n"
+
+
+def test_a_step_that_dies_is_a_failure_and_not_the_end(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["gpu_checks.py", "pool", "--device", "cpu"])
+    monkeypatch.setattr(gpu_checks, "__file__", str(BENCHMARKS / "no_such_file.py"))
+    assert gpu_checks.main() == 1
+    assert "exhaust on cpu ended with" in capsys.readouterr().out
+
+
+def test_paper_maps_are_timed_one_by_one_and_together(monkeypatch, capsys):
+    monkeypatch.setattr(gpu_checks, "FEATURES", (6, 8))
+    monkeypatch.setattr(gpu_checks, "CHANNELS", 32)
+    verdict = gpu_checks.table(DEVICE, 3, (160, 120))
+    assert all(name in verdict for name in ("surface", "color", "infrared", "latent", "all"))
+    assert "| latent |" in capsys.readouterr().out

@@ -103,7 +103,7 @@ class VoxelGrid:
         self.index = self._borrow_tree()
         self._pools = {field.name: Pool(field, FIRST_CAPACITY) for field in (KEYS, *self.fields)}
         self._leaves, self._touched = 0, 0
-        self._inherited = self.runtime.leaves.get(self.index, 0)
+        self._inherited = self.runtime.earlier.get(self.index, 0)
         self.runtime.grids.add(self)
 
     def __getitem__(self, name: str) -> DeviceArray:
@@ -132,6 +132,7 @@ class VoxelGrid:
             # one of an equal map, for which kernels are compiled already, if there is one
             alike = [place for place, (fields, _) in enumerate(free) if fields == self.fields]
             _, tree = free.pop(alike[-1] if alike else -1)
+            self.runtime.earlier[tree] = _count_free(self.runtime, tree)
             if self.runtime.device == "cpu":
                 tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
             else:  # there nodes that were given back are not safe to fill again (taichi#6401)
@@ -139,7 +140,9 @@ class VoxelGrid:
                 tree.stamp.fill(0)
         else:
             self.runtime.count_tree()
-            if _index_bytes(self.runtime) > _index_room(self.runtime):
+            if _too_large(self.runtime):
+                _recount(self.runtime)
+            if _too_large(self.runtime):
                 self.runtime.trees -= 1
                 raise CapacityError(
                     "the index of another map would not fit into the device memory that is kept for "
@@ -162,16 +165,15 @@ class VoxelGrid:
         """
         self._touched += voxels
         self._note_leaves()
-        if self._alone_too_large() or self._together_too_large():
-            for grid in self.runtime.grids:  # touched voxels may have been there before: count
-                grid.recount()
+        if self._alone_too_large() or _too_large(self.runtime):
+            _recount(self.runtime)
         if self._alone_too_large():
             raise CapacityError(
                 f"the map holds {self.count:,} voxels and its index would pass "
                 f"{SPARSE_LIMIT / 1e9:.1f} GB, where Taichi is no longer safe: use larger voxels or "
                 "save the map and start a new one"
             )
-        if self._together_too_large():
+        if _too_large(self.runtime):
             raise CapacityError(
                 f"the indices of all maps of this process, {len(self.runtime.grids)} now and those "
                 f"before, would pass {_index_room(self.runtime) / 1e9:.2f} GB, where Taichi is no "
@@ -190,9 +192,6 @@ class VoxelGrid:
 
     def _alone_too_large(self) -> bool:
         return (self._leaves + self._touched) * BYTES_PER_LEAF > SPARSE_LIMIT
-
-    def _together_too_large(self) -> bool:
-        return _index_bytes(self.runtime) > _index_room(self.runtime)
 
     def reserve(self, extra: int) -> None:
         """Make room for `extra` more voxels; raises CapacityError before sparse memory becomes
@@ -316,6 +315,23 @@ def _index_bytes(live: runtime.Runtime) -> int:
 def _index_room(live: runtime.Runtime) -> int:
     """Bytes of sparse nodes that are safe."""
     return SPARSE_POOL if live.device == "cpu" else live.sparse_pool - CUDA_RESERVE
+
+
+def _too_large(live: runtime.Runtime) -> bool:
+    return _index_bytes(live) > _index_room(live)
+
+
+def _recount(live: runtime.Runtime) -> None:
+    """Count the leaves of all trees: what was touched may have been there before."""
+    for grid in live.grids:
+        grid.recount()
+    for _, tree in live.free_trees:
+        live.leaves[tree] = _count_free(live, tree)
+
+
+def _count_free(live: runtime.Runtime, tree: kernels.Index) -> int:
+    """Leaves that a tree which no map uses ever had."""
+    return max(live.earlier.get(tree, 0), int(kernels.count_leaves(tree)))
 
 
 def _build_tree() -> kernels.Index:

@@ -198,6 +198,23 @@ def test_the_indices_of_all_maps_count_together(monkeypatch):
     assert min(map(len, grids)) > 1000
 
 
+def test_what_a_map_that_is_gone_touched_again_and_again_counts_once():
+    """Its tree keeps the memory of the leaves that there were, not of all that was noted."""
+    gc.collect()
+    live, grid = runtime.current(), a_grid()
+    index, before = grid.index, live.earlier.get(grid.index, 0)
+    points = np.random.default_rng(5).uniform(-200, 200, (1000, 3)).astype(np.float32)
+    for _ in range(9):
+        keys = touch(grid, points)
+        grid.claim(len(keys), keys, np.ones(len(keys), np.float32), np.empty(len(keys), np.int32))
+    counted = kernels.count_leaves(index)
+    assert live.leaves[index] >= 9 * counted > 0
+    del grid
+    again = a_grid()
+    again.recount()
+    assert again.index is index and live.leaves[index] == max(before, counted)
+
+
 @pytest.fixture
 def like_cuda(monkeypatch):
     """The live runtime as on a GPU: a pool of fixed size, and nodes that are never given back."""
@@ -211,6 +228,7 @@ def like_cuda(monkeypatch):
 def test_the_pool_of_a_gpu_is_not_run_over(like_cuda, monkeypatch):
     """It is counted by whole chunks, and keeps room for what a frame adds before it is counted."""
     monkeypatch.setattr(like_cuda, "leaves", {})
+    monkeypatch.setattr(like_cuda, "earlier", {})
     grid, rng = a_grid(), np.random.default_rng(21)  # other places than those of tests before
     grid.recount()  # a tree that was used before keeps its nodes
     monkeypatch.setattr(voxel_grid, "NODES_PER_CHUNK", 1000)
