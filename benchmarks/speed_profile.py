@@ -8,7 +8,7 @@ import inspect
 import re
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -85,67 +85,87 @@ def _cells(masks: np.ndarray) -> np.ndarray:
     return np.unpackbits(words.view(np.uint8), axis=-1).sum(axis=-1)
 
 
-def _rows(array: Any, rows: int) -> np.ndarray:
-    """The first rows of an array that may have more room."""
-    return (array if isinstance(array, np.ndarray) else array.to_numpy())[:rows]
+def _rows(array: Any, rows: int | None) -> np.ndarray:
+    """The first rows of an array that may have more room; None: all."""
+    return (array.to_numpy() if hasattr(array, "to_numpy") else np.asarray(array))[:rows]
+
+
+def _clipping(of: Arguments) -> tuple[float, float]:
+    images = 3 if "inverse" in of else 2
+    return 4 * images * _pixels(of["depth"]), 0
 
 
 def _normals(of: Arguments) -> tuple[float, float]:
     pixels, radius = _pixels(of["inverse"]), of["radius"]
     pairs = 2 * (2 * radius + 1) * radius
-    return 16 * pixels, pixels * (6 * pairs / 4 + 35)
+    flops = pixels * (6 * pairs / 4 + 35)
+    if "places" in of:  # points, normals, counts and places of patches
+        return pixels * (4 + 32 / 4), flops
+    return pixels * 16, flops
 
 
 def _binning(of: Arguments) -> tuple[float, float]:
-    points = of["points"].shape[0]
-    width = sum(of["channels"]) + 3 * of["with_positions"]
-    return points * 4 * (3 + sum(of["channels"])), points * (10 + width)
+    channels = sum(of["channels"])
+    points, numbers = of["points"].shape[0], 3 + channels
+    if "found" in of:
+        points, numbers = int(_rows(of["found"], None).sum()), numbers + 1
+    return points * 4 * numbers, points * (10 + channels + 3 * of["with_positions"])
 
 
 def _compacting(of: Arguments) -> tuple[float, float]:
     cells = int(_cells(_rows(of["masks"], of["blocks"])).sum())
     channels = of["channels"]
-    return cells * (2 * (4 + 8 * channels) + 4 * (1 + channels)), cells * (2 + 2 * channels)
+    return cells * (2 * 8 * (1 + channels) + 4 * (1 + channels)), cells * (2 + 2 * channels)
 
 
 def _encoding(of: Arguments) -> tuple[float, float]:
-    layout, blocks = of["layout"], of["blocks"]
-    masks, neighbors = _rows(of["masks"], blocks), _rows(of["neighbors"], blocks)
-    window = of["window"].to_numpy()
-    seen = _cells(masks[neighbors] & window)  # (B, 27) cells of every neighbour
-    solved = _rows(of["totals"], blocks) >= of["minimum"]
+    layout = of["layout"]
+    begin, end = of.get("begin", 0), of["end"] if "end" in of else of["blocks"]
+    totals = of["totals"] if "totals" in of else of["rows"]
+    points = _rows(totals, end).reshape(end, -1)[begin:, -1 if "totals" in of else 1]
+    masks, neighbors = _rows(of["masks"], None), _rows(of["neighbors"], end)[begin:]
+    seen = _cells(masks[neighbors] & _rows(of["window"], 27))  # (B, 27) cells
+    solved = points >= of["minimum"]
     columns = np.where(neighbors >= 0, seen, 0).sum(axis=1)[solved].sum()
     columns *= 4 if layout.derivatives else 1
     size, rows = layout.size // 4, layout.rows // 4  # in patches of 4 x 4
     patches = sum(min(i + 1, size) for i in range(rows))
     solve = layout.size**3 / 3 + layout.size**2 * (layout.rows - layout.size + 2 * layout.channels)
     flops = 32.0 * patches * columns + solve * solved.sum()
-    cells = int(_cells(masks).sum())
-    moved = cells * 4 * (1 + layout.channels) + blocks * 4 * (27 + 2 + 3)
+    cells = int(_cells(masks[begin:end]).sum())
+    moved = cells * 4 * (1 + layout.channels) + (end - begin) * 4 * (27 + 2 + 3)
     return moved + 4 * solved.sum() * layout.latent_rows * layout.channels, flops
 
 
 def _voting(of: Arguments) -> tuple[float, float]:
-    voxels, rank, depth = of["voxels"], of["rank"], of["depth"]
-    K, T = np.array(of["K"]), np.array(of["T_camera_world"], np.float64)
-    centers = (_rows(of["keys"], voxels) + 0.5) * of["voxel_size"]
-    x, y, z = T[:, :3] @ centers.T + T[:, 3:]
-    u, v = x / np.maximum(z, 1e-3) * K[0] + K[2], y / np.maximum(z, 1e-3) * K[1] + K[3]
-    seen = (z > 0) & (u > 0) & (v > 0) & (u < depth.shape[1]) & (v < depth.shape[0])
-    supported = _cells(_rows(of["masks"], voxels)[seen]).sum()
-    others = 64 * seen.sum() - supported
-    moved = 12.0 * voxels + seen.sum() * (8 + 4 * rank + 2 * 64) + 4 * _pixels(depth)
-    return moved, supported * (8.0 * rank + 90) + others * 30.0
+    begin, end = of.get("begin", 0), of["end"] if "end" in of else of["voxels"]
+    rank, K, poses = (
+        of["rank"],
+        np.array(of["K"]),
+        _rows(of["T_camera_world"], None).reshape(-1, 3, 4),
+    )
+    height, width = of["depth"].shape[-2:]
+    centers = (_rows(of["keys"], end)[begin:] + 0.5) * of["voxel_size"]
+    supported = _cells(_rows(of["masks"], end)[begin:])
+    anywhere, flops, cells = np.zeros(end - begin, bool), 0.0, 0
+    for T in poses.astype(np.float64):
+        x, y, z = T[:, :3] @ centers.T + T[:, 3:]
+        u, v = x / np.maximum(z, 1e-3) * K[0] + K[2], y / np.maximum(z, 1e-3) * K[1] + K[3]
+        seen = (z > 0) & (u > 0) & (v > 0) & (u < width) & (v < height)
+        anywhere, cells = anywhere | seen, cells + 64 * int(seen.sum())
+        flops += 90.0 * supported[seen].sum() + 30.0 * (64 - supported[seen]).sum()
+    moved = 12.0 * (end - begin) + anywhere.sum() * (8 + 4 * rank + 2 * 64)
+    images = 4.0 * min(height * width * len(poses), cells)  # a pixel a cell, or all pixels
+    return moved + images, flops + 8.0 * rank * supported[anywhere].sum()
 
 
+FRONT = "a float in, {} out a pixel"
+NORMALS = "6 operations a pair of the window, shared by 4 pixels, and 35"
 COUNTS = {
-    "clip_depth": Count(
-        "a float in, a float out a pixel", lambda of: (8 * _pixels(of["depth"]), 0)
-    ),
-    "estimate_normals": Count(
-        "a float in, three out a pixel; 6 operations a pair of the window, shared by 4 pixels, and 35",
-        _normals,
-    ),
+    "clip_depth": Count(FRONT.format("one"), _clipping),
+    "clip_and_invert": Count(FRONT.format("two"), _clipping),
+    "estimate_normals": Count(f"{FRONT.format('three')}; {NORMALS}", _normals),
+    "make_patches": Count(f"a float in a pixel, 32 bytes out a quad; {NORMALS}", _normals),
     "bin_points": Count("points and values in; 10 operations and a sum a point", _binning),
     "compact_cells": Count(
         "sums of cells with points in and set to 0, their means out", _compacting
@@ -156,8 +176,8 @@ COUNTS = {
         _encoding,
     ),
     "vote_cells": Count(
-        "all keys, masks, latents and evidence of voxels in view, the depth image once; 8 l + 90 "
-        "operations a cell with support, 30 a cell without",
+        "all keys, masks, latents and evidence of voxels in view, a pixel a cell and view; 8 l operations a "
+        "cell with support, and a view 90, 30 without support",
         _voting,
     ),
 }
@@ -224,9 +244,10 @@ def profile(frames: Sequence[uf.Frame], config: uf.Config, warm_up: int) -> str:
     machine = measure_machine()
     return (
         f"{count} frames, Pipeline.step {wall:.1f} ms a frame by the clock, {cpu:.1f} of the processors\n\n"
-        f"{kernel_table(times, counted, machine, count)}\n\n{how_counted()}\n\n"
-        f"This machine: {machine.bytes_per_ms / 1e6:.1f} GB/s (a copy), {machine.flops_per_ms / 1e6:.0f} "
-        "GFlop/s (a product of matrices), NumPy on all processors."
+        f"{kernel_table(times, counted, machine, count)}\n\n{how_counted(counted)}\n\n"
+        "Kernels are timed by the clock. This machine, NumPy on all processors: "
+        f"{machine.bytes_per_ms / 1e6:.1f} GB/s (a copy), {machine.flops_per_ms / 1e6:.0f} GFlop/s (a "
+        "product of matrices)."
     )
 
 
@@ -256,6 +277,6 @@ def kernel_table(
     return markdown(header, rows)
 
 
-def how_counted() -> str:
-    rows = [[name, count.how] for name, count in COUNTS.items()]
+def how_counted(names: Iterable[str]) -> str:
+    rows = [[name, COUNTS[name].how] for name in sorted(names)]
     return markdown(["kernel", "how its bytes and operations are counted"], rows)
