@@ -270,10 +270,11 @@ def kernel_table(
             least = machine.least(moved, flops)
             times_least = f"{ms / frames / least:.0f}"
             cells = [f"{moved / 1e6:.1f}", f"{flops / 1e6:.1f}", f"{least:.2f}", times_least]
-        rows.append([name, f"{ms / frames:.2f}", f"{calls / frames:.1f}", *cells])
-    rows.append(["others", f"{rest / frames:.2f}", *["-"] * 5])
-    rows.append(["all kernels", f"{total / frames:.2f}", *["-"] * 5])
-    header = ["kernel", "ms a frame", "calls a frame", "MB", "MFlop", "least ms", "times that"]
+        share = f"{100 * ms / total:.0f}"
+        rows.append([name, f"{ms / frames:.2f}", share, f"{calls / frames:.1f}", *cells])
+    rows.append(["others", f"{rest / frames:.2f}", *["-"] * 6])
+    rows.append(["all kernels", f"{total / frames:.2f}", "100", *["-"] * 5])
+    header = ["kernel", "ms a frame", "%", "calls a frame", "MB", "MFlop", "least ms", "times that"]
     return markdown(header, rows)
 
 

@@ -258,8 +258,8 @@ def test_profile_runs_the_frames_and_says_how_it_counts(small_room, monkeypatch)
     # of a process that Taichi was started in with its profiler on
     monkeypatch.setattr(speed_profile, "kernel_times", lambda: {"vote_cells": (6.0, 2)})
     text = speed_profile.profile(list(small_room[:4]), Config(), 2)
-    assert "2 frames, Pipeline.step" in text and "| vote_cells | 3.00 | 1.0 | " in text
-    assert "| vote_cells | 3.00 | 1.0 | - |" not in text
+    assert "2 frames, Pipeline.step" in text and "| vote_cells | 3.00 | 100 | 1.0 | " in text
+    assert "| vote_cells | 3.00 | 100 | 1.0 | - |" not in text
     for name in ("bin_points", "compact_cells", "encode_cells", "vote_cells"):
         assert f"| {name} | {speed_profile.COUNTS[name].how} |" in text
 
@@ -269,8 +269,8 @@ def test_profile_sets_the_least_time_beside_a_kernels():
     times = {"encode_cells": (40.0, 4), "fuse": (10.0, 2), "tiny": (0.01, 2)}
     text = speed_profile.kernel_table(times, {"encode_cells": [(2e6, 1e6)] * 4}, machine, 2)
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:]]
-    assert rows[0] == ["encode_cells", "20.00", "2.0", "4.0", "2.0", "4.00", "5"]
-    assert rows[1] == ["fuse", "5.00", "1.0", "-", "-", "-", "-"]
+    assert rows[0] == ["encode_cells", "20.00", "80", "2.0", "4.0", "2.0", "4.00", "5"]
+    assert rows[1] == ["fuse", "5.00", "20", "1.0", "-", "-", "-", "-"]
     assert [row[:2] for row in rows[2:]] == [["others", "0.01"], ["all kernels", "25.00"]]
 
 
