@@ -4,33 +4,36 @@ IV-B).
 
 import taichi as ti
 
-from .arrays import Bytes1, Floats2, Floats3, Ints2, Masks2, row3
+from .arrays import Bytes1, Floats1, Floats2, Floats3, Ints2, Masks2, row3
 from .cells import BLOCK_CELLS, CELLS, cell_bit, cell_index, first_cell
-from .encoding import table_features
 from .index import INDEX_HALF, all_within, find, voxel_of
 
 UNKNOWN = 1e9  # signed distance where no voxel reaches
+CHUNK = 32  # points that one thread sorts by lattice corner
+CHANNELS = 4  # decoded at once
+CODE_BITS = 15  # of an index along an axis
+NOWHERE, UNCOVERED = -1, -2  # codes of a point: not (or no longer) asked for; of the nearest voxel
 
 
 @ti.func
-def decode(
+def read_latent(
+    # in:
     layout: ti.template(),
-    s: ti.i32,
-    t: ti.template(),
-    latents: ti.template(),
-    table: ti.template(),
-    nodes: ti.i32,
+    s: ti.i32,  # slot, -1 where there is no voxel
+    o: ti.i32,  # which of the eight voxels around a lattice corner it is
+    first: ti.i32,  # channel
+    latents: ti.template(),  # (S, l [+ 1], c)
+    # in and out:
+    F: ti.template(),  # (CHANNELS x 8 x size,) row o of every channel becomes that of the latent
+    prior: ti.template(),  # (CHANNELS x 8,) and its prior mean
 ):
-    """f_dec(t, F) of the voxel in slot s, plus its prior mean (Eq. 7)."""
-    rank, channels = ti.static(layout.rank, layout.channels)
-    f = table_features(t, rank, table, nodes)
-    values = ti.Vector([0.0] * channels)
-    for c in ti.static(range(channels)):
-        value = latents[s, rank, c] if ti.static(layout.centered) else 0.0
-        for a in ti.static(range(rank)):
-            value += f[a] * latents[s, a, c]
-        values[c] = value
-    return values
+    """Copy some channels of a voxel's latent to where sums over eight voxels find them."""
+    for c in ti.static(range(ti.min(layout.channels, CHANNELS))):
+        channel = ti.min(first + c, layout.channels - 1)
+        for a in range(layout.rank):
+            F[(c * 8 + o) * layout.size + a] = latents[s, a, channel] if s >= 0 else 0.0
+        if ti.static(layout.centered):
+            prior[c * 8 + o] = latents[s, layout.rank, channel] if s >= 0 else 0.0
 
 
 @ti.func
@@ -60,6 +63,34 @@ def tent_weight(t: ti.template()) -> ti.f32:
     return ti.max(tent, 1e-6)  # on the border of the only voxel there is, its value still counts
 
 
+@ti.func
+def node_shares(r: ti.template()):
+    """Trilinear weights of the eight nodes around a point, at r in [0, 1]^3 between them."""
+    shares = ti.Vector([1.0] * 8)
+    for o, d in ti.static(ti.ndrange(8, 3)):
+        shares[o] *= r[d] if ti.static(o >> 2 - d & 1 == 1) else 1.0 - r[d]
+    return shares
+
+
+@ti.func
+def corner_code(x: ti.template()) -> ti.i64:
+    """The lattice corner whose eight doubled voxels contain x, as one number; NOWHERE out of the
+    index range.
+    """
+    code = ti.i64(NOWHERE)
+    if all_within(x, INDEX_HALF - 1.0):
+        at = ti.cast(voxel_of(x - 0.5) + INDEX_HALF, ti.i64)
+        code = (at[0] << 2 * CODE_BITS) + (at[1] << CODE_BITS) + at[2]
+    return code
+
+
+@ti.func
+def corner_of_code(code: ti.i64):
+    """The lattice corner of a code."""
+    at = ti.Vector([code >> 2 * CODE_BITS, code >> CODE_BITS, code])
+    return (ti.cast(at, ti.i32) & (1 << CODE_BITS) - 1) - INDEX_HALF
+
+
 @ti.kernel
 def query_points(
     # in:
@@ -70,37 +101,91 @@ def query_points(
     per_meter: ti.f32,
     index: ti.template(),
     latents: Floats3,  # (S, l [+ 1], c)
-    table: Floats2,  # (nodes^3, l) f_posi on a lattice over the doubled voxel
-    nodes: ti.i32,
+    # f_posi of the eight voxels around a lattice corner, on nodes between their centres
+    table: Floats1,  # (nodes x 8 x size,)
+    spaces: ti.i32,  # between nodes, along an edge
     # points that no voxel covers take the value of the nearest one within this many voxels
     reach: ti.i32,
     # out:
     values: Floats2,  # (N, c) 0 where there is none
     valid: Bytes1,  # (N,) = 1 where a voxel covers the point
 ):
-    for n in range(points.shape[0]):
-        x = row3(points, n) * per_meter
-        total = ti.Vector([0.0] * layout.channels)
-        weight, covered = 0.0, 0
-        if all_within(x, INDEX_HALF - 1.0):
-            corner = voxel_of(x - 0.5) if ti.static(blend) else voxel_of(x)
-            covering = ti.static(8 if blend else 1)
-            for o in range(covering + 1):
-                ijk, s = corner, -1
-                if o < covering:
-                    ijk = corner + ti.Vector([o // 4, o // 2 % 2, o % 2])
-                    s = find(index, ijk)
-                elif weight == 0 and reach > 0:
-                    s, ijk = nearest_voxel(x, reach, index)
+    # Neighbours in a list mostly lie between the same eight voxels. Of every CHUNK points, those
+    # that do are decoded together: reading eight latents costs more than a product with them.
+    size, group = ti.static(layout.size, min(layout.channels, CHANNELS))
+    passes = ti.static((layout.channels + group - 1) // group)
+    chunks = (points.shape[0] + CHUNK - 1) // CHUNK
+    for task in range(chunks * passes):
+        begin, first = task // passes * CHUNK, task % passes * group
+        count = ti.min(points.shape[0] - begin, CHUNK)
+        codes = ti.Vector([ti.i64(NOWHERE)] * CHUNK)
+        F, prior = ti.Vector([0.0] * (group * 8 * size)), ti.Vector([0.0] * (group * 8))
+        present, tents = ti.Vector([0.0] * 8), ti.Vector([0.0] * (8 * size))
+        for k in range(count):
+            codes[k] = corner_code(row3(points, begin + k) * per_meter)
+            valid[begin + k] = 0
+            for c in range(group):
+                if first + c < layout.channels:
+                    values[begin + k, first + c] = 0.0
+        # first all points by corner, then one by one those that no voxel covers
+        for turn in range(2 * count):
+            head = turn % count
+            code, last, corner = codes[head], 0, ti.Vector([0, 0, 0])
+            slots = ti.Vector([-1] * 8)
+            if turn < count:
+                if code >= 0:
+                    last, corner = count, corner_of_code(code)
+                    for o in range(8):
+                        slots[o] = find(index, corner + ti.Vector([o >> 2, o >> 1 & 1, o & 1]))
+            elif code == UNCOVERED:
+                x = row3(points, begin + head) * per_meter
+                s, ijk = nearest_voxel(x, reach, index)
                 if s >= 0:
-                    t = ti.math.clamp((x - ijk - 0.5) * 0.5, -0.5, 0.5)
-                    tent = tent_weight(t) if ti.static(blend) else 1.0
-                    total += tent * decode(layout, s, t, latents, table, nodes)
-                    weight += tent
-                    covered += ti.cast(o < covering, ti.i32)
-        valid[n] = ti.cast(covered > 0, ti.u8)
-        for c in ti.static(range(layout.channels)):
-            values[n, c] = total[c] / ti.max(weight, 1e-12)
+                    above = ti.cast(x < ijk + 0.5, ti.i32)
+                    last, corner = head + 1, ijk - above
+                    slots[above[0] * 4 + above[1] * 2 + above[2]] = s
+            voxels = 8 if last > 0 else 0
+            for o in range(voxels):
+                present[o] = ti.cast(slots[o] >= 0, ti.f32)
+                read_latent(layout, slots[o], o, first, latents, F, prior)
+            for k in range(head, last):
+                if codes[k] == code:
+                    n = begin + k
+                    x = row3(points, n) * per_meter
+                    u = ti.math.clamp(x - 0.5 - corner, 0.0, 1.0)
+                    node = ti.math.clamp(ti.floor(u * spaces, ti.i32), 0, spaces - 1)
+                    shares = node_shares(u * spaces - node)
+                    edge = spaces + 1
+                    row = ((node[0] * edge + node[1]) * edge + node[2]) * (8 * size)
+                    weight, total = 0.0, ti.Vector([0.0] * group)
+                    for o in range(8):
+                        step = ti.Vector([o >> 2, o >> 1 & 1, o & 1])
+                        tent = tent_weight((u - step) * 0.5) * present[o]
+                        if ti.static(not blend):
+                            own = ti.cast(u >= 0.5, ti.i32)
+                            mine = turn >= count or own[0] * 4 + own[1] * 2 + own[2] == o
+                            tent = present[o] if mine else 0.0
+                        weight += tent
+                        for a in ti.static(range(size)):
+                            tents[o * size + a] = tent
+                        for c in ti.static(range(group)):
+                            total[c] += tent * prior[c * 8 + o]
+                    # nothing is stored in this loop, so that it vectorises
+                    for j in range(8 * size):
+                        f = 0.0
+                        for m in ti.static(range(8)):
+                            above = ti.static(m >> 2) * edge * edge + ti.static(m >> 1 & 1) * edge
+                            f += shares[m] * table[row + (above + ti.static(m & 1)) * 8 * size + j]
+                        f *= tents[j]
+                        for c in ti.static(range(group)):
+                            total[c] += f * F[c * 8 * size + j]
+                    if weight > 0:
+                        for c in ti.static(range(group)):
+                            if first + c < layout.channels:
+                                values[n, first + c] = total[c] / weight
+                    covered = weight > 0 and turn < count
+                    valid[n] = ti.cast(covered, ti.u8)
+                    codes[k] = UNCOVERED if weight == 0 and reach > 0 else NOWHERE
 
 
 @ti.func

@@ -22,6 +22,7 @@ from .voxel_grid import VoxelGrid
 
 CPU_WORKERS, GPU_WORKERS = 64, 8192
 NODES = 33  # of the lattice of f_posi that decoding reads, along an edge of the doubled voxel
+SPACES = NODES // 2  # between nodes, from the centre of a voxel to the next one's
 
 
 class Encoder:
@@ -129,13 +130,28 @@ class PositionTables:
 
     @property
     def lattice(self) -> DeviceArray:
-        """(NODES^3, l) f_posi over the doubled voxel, made at the first query and shared by all
-        maps of these encoder settings.
+        """((SPACES + 1)^3 x 8 x size,) f_posi of the eight voxels around a lattice corner, on nodes
+        between their centres; made at the first query and shared by all maps of these settings.
         """
         settings, shape = self.encoding.settings, (NODES, NODES, NODES)
         return self.arena.exact(
-            f"lattice of {settings}", lambda: to_device(self.encoding.lattice(NODES)), shape
+            f"lattice of {settings}",
+            lambda: to_device(between_centers(self.encoding.lattice(NODES)).reshape(-1)),
+            shape,
         )
+
+
+def between_centers(lattice: NDArray[np.float32]) -> NDArray[np.float32]:
+    """((SPACES + 1)^3, 8, size): what each of the eight voxels around a lattice corner has at the
+    nodes between their centres, an eighth of its `lattice` (NODES^3, l); zeros fill up the size.
+    """
+    rank, edge = lattice.shape[1], SPACES + 1
+    cube = lattice.reshape(NODES, NODES, NODES, rank)
+    between = np.zeros((edge, edge, edge, 8, Layout(rank, 1).size), np.float32)
+    for o, steps in enumerate(product((0, 1), repeat=3)):
+        eighth = tuple(slice(SPACES * (1 - up), SPACES * (1 - up) + edge) for up in steps)
+        between[..., o, :rank] = cube[eighth]
+    return between.reshape(edge**3, 8, -1)
 
 
 class Decoder:
@@ -152,8 +168,8 @@ class Decoder:
         `blend` and `reach` are those of `kernels.query.query_points`.
         """
         points = check_points(points)
-        values = np.zeros((len(points), self.layout.channels), np.float32)
-        valid = np.zeros(len(points), np.uint8)
+        values = np.empty((len(points), self.layout.channels), np.float32)
+        valid = np.empty(len(points), np.uint8)
         if len(points):
             query.query_points(
                 self.layout,
@@ -163,7 +179,7 @@ class Decoder:
                 grid.index,
                 grid["latents"],
                 self.tables.lattice,
-                NODES,
+                SPACES,
                 reach,
                 values,
                 valid,
