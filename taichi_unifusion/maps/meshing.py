@@ -18,6 +18,7 @@ from .. import runtime
 from ..geometry.triangles import areas
 from ..kernels import marching_cubes as kernels
 from ..kernels import query
+from ..kernels.cells import CELLS
 from ..kernels.visibility import interpolate_evidence
 from ..types import Mesh
 from .cube_tables import STEPS, marching_cubes_tables
@@ -47,7 +48,7 @@ def extract_mesh(
     A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map
     holds evidence, the mesh ends on the line where evidence falls below `min_evidence`.
     """
-    codes, support = _cubes(grid, support_closing)
+    codes, support = _cubes(grid, support_closing, resolution)
     if not len(codes):
         return Mesh(
             np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32)
@@ -95,8 +96,10 @@ def cut_mesh(
     corners = a + b + c  # that stay
     if (corners == 3).all():
         return vertices, faces
-    odd_in = _odd_first(np.compress(corners == 1, faces, axis=0), inside)  # the first stays
-    odd_out = _odd_first(np.compress(corners == 2, faces, axis=0), ~inside)  # the first goes
+    crossed = np.flatnonzero((corners > 0) & (corners < 3))
+    one_in = corners[crossed] == 1
+    odd_in = _odd_first(faces[crossed[one_in]], inside)  # the first stays
+    odd_out = _odd_first(faces[crossed[~one_in]], ~inside)  # the first goes
     first = np.concatenate([odd_in[:, 0], odd_in[:, 0], odd_out[:, 0], odd_out[:, 0]])
     other = np.concatenate([odd_in[:, 1], odd_in[:, 2], odd_out[:, 1], odd_out[:, 2]])
     low, high = np.minimum(first, other), np.maximum(first, other)
@@ -138,8 +141,7 @@ def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.i
 def _without_unused(
     vertices: NDArray[np.float32], faces: NDArray[np.int32]
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    used = np.zeros(len(vertices), bool)
-    used[faces.reshape(-1)] = True
+    used = np.bincount(faces.reshape(-1), minlength=len(vertices)) > 0
     return np.compress(used, vertices, axis=0), _ranks(used).take(faces)
 
 
@@ -175,7 +177,9 @@ def connected_parts(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32
     return part
 
 
-def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
+def _cubes(
+    grid: VoxelGrid, support_closing: int, resolution: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
     """Sorted codes (Q,) of the cubes that hold surface or close one that does, and their support
     masks (Q, 2).
     """
@@ -183,13 +187,26 @@ def _cubes(grid: VoxelGrid, support_closing: int) -> tuple[NDArray[np.int64], ND
     support = np.empty((len(codes), 2), np.uint32)
     if len(codes):
         query.corner_support(_keys(codes), grid.index, grid["masks"], support_closing, support)
-    with_surface = support.any(axis=1)
-    codes, support = codes[with_surface], support[with_surface]
+    with_surface = (support[:, 0] | support[:, 1]) != 0
+    codes, support = np.compress(with_surface, codes), np.compress(with_surface, support, axis=0)
     # the last cells of a cube need the samples above
-    closed = _with_upper(codes)
+    low, high = np.ascontiguousarray(support.T)
+    wanted = [
+        np.compress((low & last[0] | high & last[1]) != 0, codes) + step @ CODE_STEPS
+        for step, last in zip(STEPS[1:], _last_cells(resolution)[1:], strict=True)
+    ]
+    closed = _sorted_once(np.concatenate([codes, *wanted]))
     closed_support = np.zeros((len(closed), 2), np.uint32)
     closed_support[np.searchsorted(closed, codes)] = support
     return closed, closed_support
+
+
+def _last_cells(resolution: int) -> NDArray[np.uint32]:
+    """(8, 2) support cells of a cube whose mesh cells reach into the cube at each of STEPS."""
+    last = (2 * resolution - 1) * CELLS // (2 * resolution)  # holds the middle of the last cell
+    places = np.indices([CELLS] * 3).reshape(3, -1).T  # (64, 3)
+    touching = ((places == last) | (STEPS[:, None] == 0)).all(axis=2)  # (8, 64)
+    return np.packbits(touching, axis=1).view(">u4").astype(np.uint32)
 
 
 def _codes(keys: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -208,10 +225,14 @@ def _keys(codes: NDArray[np.int64]) -> NDArray[np.int32]:
 def _with_upper(codes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Sorted codes of lattice points, and of all that lie at one of STEPS from one of them."""
     for step in CODE_STEPS[::-1]:
-        both = np.concatenate([codes, codes + step])
-        both.sort(kind="stable")  # merges what is in order
-        codes = both[np.diff(both, prepend=-1) != 0]
+        codes = _sorted_once(np.concatenate([codes, codes + step]))
     return codes
+
+
+def _sorted_once(codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Sorted codes of which each comes once, from stretches that are in order."""
+    codes.sort(kind="stable")  # merges what is in order
+    return codes[np.diff(codes, prepend=-1) != 0]
 
 
 def _upper_cubes(codes: NDArray[np.int64]) -> NDArray[np.int32]:

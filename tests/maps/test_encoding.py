@@ -9,7 +9,7 @@ from encoding_kernels import encode_gradients, encode_positions, interpolate_pos
 from scipy.special import gamma, kv
 
 from taichi_unifusion.errors import InputError
-from taichi_unifusion.maps.encoder import NODES
+from taichi_unifusion.maps.encoder import NODES, SPACES, between_centers
 from taichi_unifusion.maps.encoding import (
     EncoderSettings,
     PositionEncoding,
@@ -224,3 +224,14 @@ def test_encode_gradients_equals_its_twin(t):
     )
     twin = reference.encode_gradients(oracle(SMALL), t.astype(np.float32).astype(float))
     np.testing.assert_allclose(gradients, twin, atol=SINGLE * np.abs(twin).max())
+
+
+def test_between_centers_is_f_posi_of_all_eight_voxels_at_the_same_place():
+    """Eighths of one lattice, in the order of the corners; zeros fill up the size."""
+    settings = EncoderSettings(rank=6, anchors=64)
+    between = between_centers(PositionEncoding(settings).lattice(NODES))
+    u = np.stack(np.meshgrid(*[np.linspace(0, 1, SPACES + 1)] * 3, indexing="ij"), axis=-1)
+    for o, step in enumerate(reference.CORNERS):
+        wanted = oracle(settings)((u.reshape(-1, 3) - step) / 2)
+        np.testing.assert_allclose(between[:, o, :6], wanted, atol=SINGLE)
+    assert between.shape == ((SPACES + 1) ** 3, 8, 8) and not between[..., 6:].any()

@@ -13,7 +13,9 @@ from skimage.measure import marching_cubes
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.kernels import marching_cubes as kernels
 from taichi_unifusion.maps import SurfaceMap, meshing
+from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.meshing import drop_small_parts
+from taichi_unifusion.maps.voxel_grid import VoxelData
 from taichi_unifusion.types import Mesh
 
 R = 4  # samples a cube edge in these tests
@@ -253,6 +255,59 @@ def test_codes_are_in_the_order_of_keys_and_gain_all_upper_neighbours(places):
     wanted = {tuple((np.array(key) + step).tolist()) for key in places for step in meshing.STEPS}
     np.testing.assert_array_equal(meshing._keys(meshing._with_upper(codes)), sorted(wanted))
     assert not len(meshing._with_upper(codes[:0]))
+
+
+@pytest.mark.parametrize("resolution", [1, 2, 3, 4, 7, 32])
+def test_last_cells_are_those_that_hold_the_last_mesh_cells(resolution):
+    """A cube needs the one above it at a step exactly where one of these is supported."""
+    masks = reference.unpack_masks(meshing._last_cells(resolution)).reshape(8, 4, 4, 4)
+    cells = [int((i + 0.5) / resolution * 4) for i in range(resolution)]  # as classify_cells does
+    for step, mask in zip(meshing.STEPS, masks, strict=True):
+        wanted = np.zeros((4, 4, 4), bool)
+        wanted[tuple(cells[-1:] if up else slice(None) for up in step)] = True
+        np.testing.assert_array_equal(mask.astype(bool), wanted)
+
+
+@pytest.mark.parametrize("resolution", [1, 3, 4])
+def test_cubes_left_out_have_no_part_in_the_mesh(resolution):
+    """The mesh of random voxels equals that of all cubes around them, each with its samples."""
+    target = SurfaceMap(encoder=EncoderSettings(rank=6, anchors=64))
+    rng = np.random.default_rng(4)
+    keys = np.unique(rng.integers(-3, 3, (400, 3)), axis=0).astype(np.int32)
+    voxels = VoxelData(
+        keys,
+        {
+            "latents": rng.normal(size=(len(keys), 6, 1)).astype(np.float32),
+            "weights": np.ones(len(keys), np.float32),
+            "masks": np.bitwise_and.reduce(
+                rng.integers(0, 2**32, (2, len(keys), 2), dtype=np.uint32)
+            ),
+            "evidence": np.zeros((len(keys), 64), np.int8),
+        },
+    )
+    target.grid.put(voxels)
+    meshes = []
+    for codes, support in (
+        meshing._cubes(target.grid, 14, resolution),
+        all_cubes(target.grid, 14),
+    ):
+        keys, upper = meshing._keys(codes), meshing._upper_cubes(codes)
+        sdf = np.empty((len(keys), resolution**3), np.float32)
+        basis = meshing.grid_basis(target.encoder.tables.encoding, resolution)
+        meshing.query.sdf_grid(6, keys, target.grid.index, target.grid["latents"], *basis, sdf)
+        meshes.append((len(keys), meshing._march(keys, upper, support, sdf, resolution, VS)))
+    (few, mesh), (many, whole) = meshes
+    assert few < many and len(mesh[1]) > 20
+    np.testing.assert_array_equal(mesh[0], whole[0])
+    np.testing.assert_array_equal(mesh[1], whole[1])
+
+
+def all_cubes(grid, closing: int):
+    """Codes (Q,) and support (Q, 2) of all cubes around a grid's voxels, and of one more beyond."""
+    codes = meshing._with_upper(meshing._with_upper(np.sort(meshing._codes(grid.voxel_keys()))))
+    support = np.empty((len(codes), 2), np.uint32)
+    meshing.query.corner_support(meshing._keys(codes), grid.index, grid["masks"], closing, support)
+    return codes, support
 
 
 def test_an_empty_map_has_an_empty_mesh():
