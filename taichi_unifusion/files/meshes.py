@@ -7,7 +7,8 @@ from pathlib import Path
 
 from ..errors import InputError, MissingDependency
 from .atomic import atomic_write
-from .ply import Triangles, color_to_uint8, write_ply
+from .glb import write_glb
+from .ply import Triangles, colors_of, write_ply
 
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 
@@ -30,35 +31,31 @@ def write_mesh(path: str | os.PathLike, mesh: Triangles) -> None:
             f"{path}: the faces name vertices {mesh.faces.min()}..{mesh.faces.max()}, "
             f"but the mesh has {len(mesh.vertices)}"
         )
-    if suffix == ".ply":
-        with atomic_write(path) as temporary, open(temporary, "wb") as file:
-            write_ply(file, mesh)
-    else:
-        content = _encode_with_trimesh(path, mesh)
+    if suffix != ".ply" and not len(mesh.faces):
+        raise InputError(f"{path}: the mesh is empty, which {suffix} cannot hold; write a .ply")
+    if suffix == ".obj":
+        content = _encode_obj(path, mesh)
         with atomic_write(path) as temporary:
             temporary.write_bytes(content)
+        return
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        (write_ply if suffix == ".ply" else write_glb)(file, mesh)
 
 
-def _encode_with_trimesh(path: Path, mesh: Triangles) -> bytes:
-    """The bytes of a GLB or OBJ file, vertices and faces in their order."""
-    if not len(mesh.faces):
-        raise InputError(
-            f"{path}: the mesh is empty, which {path.suffix} cannot hold; write a .ply"
-        )
+def _encode_obj(path: Path, mesh: Triangles) -> bytes:
+    """The bytes of an OBJ file, vertices and faces in their order."""
     try:
         import trimesh
     except ImportError:
         raise MissingDependency(
-            f"{path}: writing {path.suffix} needs trimesh: pip install trimesh"
+            f"{path}: writing .obj needs trimesh: pip install trimesh"
         ) from None
-    color = mesh.attributes.get("color")
-    has_normals = mesh.normals is not None
     exported = trimesh.Trimesh(
         mesh.vertices,
         mesh.faces,
         vertex_normals=mesh.normals,
         process=False,
-        vertex_colors=None if color is None else color_to_uint8(color),
+        vertex_colors=colors_of(mesh),
     )
-    content = exported.export(file_type=path.suffix.lower()[1:], include_normals=has_normals)
-    return content.encode() if isinstance(content, str) else bytes(content)
+    content = exported.export(file_type="obj", include_normals=mesh.normals is not None)
+    return str(content).encode()

@@ -37,6 +37,16 @@ def color_to_uint8(color: NDArray) -> NDArray[np.uint8]:
     return (np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
+def colors_of(mesh: Triangles) -> NDArray[np.uint8] | None:
+    """The colours of a mesh as bytes (V, 3), None where it has none; InputError for another shape."""
+    color = mesh.attributes.get("color")
+    if color is None:
+        return None
+    if color.ndim != 2 or color.shape[1] != 3:
+        raise InputError(f"mesh: attribute 'color' must be (V, 3) RGB in [0, 1], got {color.shape}")
+    return color_to_uint8(color)
+
+
 def write_ply(file: BinaryIO, mesh: Triangles) -> None:
     """Write `mesh` to an open file: float positions and normals, 8-bit colours, other attributes as
     float properties.
@@ -77,16 +87,12 @@ def _columns_of(mesh: Triangles) -> tuple[list[Column], list[str]]:
     columns: list[Column] = [("<f4", ("x", "y", "z"), mesh.vertices)]
     if mesh.normals is not None:
         columns.append(("<f4", ("nx", "ny", "nz"), mesh.normals))
-    comments = []
+    comments, colors = [], colors_of(mesh)
     for name, values in mesh.attributes.items():
         if values.ndim != 2:
             raise InputError(f"mesh: attribute '{name}' must be (V, c), got {values.shape}")
         if name == "color":
-            if values.shape[1] != 3:
-                raise InputError(
-                    f"mesh: attribute 'color' must be (V, 3) RGB in [0, 1], got {values.shape}"
-                )
-            columns.append(("u1", ("red", "green", "blue"), color_to_uint8(values)))
+            columns.append(("u1", ("red", "green", "blue"), colors))
             continue
         if not re.fullmatch(r"[!-~]+", name):
             raise InputError(
