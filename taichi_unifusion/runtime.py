@@ -13,8 +13,8 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from contextlib import redirect_stdout, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
 from functools import cache
 from importlib import import_module
 from io import StringIO
@@ -235,6 +235,23 @@ def _quicken_tracing() -> None:
     for name in ("getsourcefile", "getsourcelines"):
         if hasattr(kernel_impl, name):  # not in every build of Taichi
             setattr(kernel_impl, name, cache(getattr(kernel_impl, name)))
+
+
+@contextmanager
+def compiled_sooner() -> Iterator[None]:
+    """Kernels called inside, or in a function that this decorates, are compiled without Taichi's own
+    analysis of control flow, whose time grows with the square of a kernel's length.
+
+    That halves the compilation of the long kernels of the regression, to the same code: LLVM does
+    that analysis again. Others end up longer. A kernel must always be called inside, or never.
+    """
+    ti = import_taichi()
+    config = ti.lang.impl.current_cfg()
+    before, config.cfg_optimization = config.cfg_optimization, False
+    try:
+        yield
+    finally:
+        config.cfg_optimization = before
 
 
 def _say(sentence: str) -> None:

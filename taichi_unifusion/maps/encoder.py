@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..kernels import query, regression
 from ..kernels.cells import CELLS
 from ..kernels.layout import Layout
-from ..runtime import Arena, DeviceArray, Runtime
+from ..runtime import Arena, DeviceArray, Runtime, compiled_sooner
 from .encoding import position_encoding
 from .local_lim import Binned, LocalLim, SortedSamples
 from .settings import MapSettings
@@ -52,6 +52,7 @@ class Encoder:
             table[:, 1:, :rank] = 0.5 * encoding.gradient(t)  # t moves by 1/2 a voxel
         return table
 
+    @compiled_sooner()
     def encode(self, binned: Binned) -> LocalLim:
         """Encode the averages in cells."""
         self.arena.check_loan(binned.turn)
@@ -74,6 +75,7 @@ class Encoder:
         )
         return self._local(binned, encoded, weights)
 
+    @compiled_sooner()
     def encode_samples(self, samples: SortedSamples) -> LocalLim:
         """Encode every sample as it is, as published."""
         self.arena.check_loan(samples.turn)
