@@ -102,19 +102,29 @@ def _shown(mesh: Mesh | None, name: str, look: Look, run: RunResult) -> Property
 
 
 def stage_milliseconds(steps: Sequence[StepResult]) -> dict[str, Milliseconds]:
-    """Median and mean of every stage over the frames that had it, and of whole frames; the first
-    frame's start-up included.
+    """Median and mean of every stage over the frames that had it, and of whole frames.
+
+    A stage compiles its kernels in the first frame that has it: that one is left out, and so is
+    every such frame of the whole ones, unless there is no other.
     """
-    stages = list(dict.fromkeys(stage for step in steps for stage in step.milliseconds))
-    samples = {
-        stage: [step.milliseconds[stage] for step in steps if stage in step.milliseconds]
-        for stage in stages
-    }
-    samples["frame"] = [sum(step.milliseconds.values()) for step in steps]
+    samples: dict[str, list[float]] = {}
+    frames, compiling = [], []
+    for step in steps:
+        first = not step.milliseconds.keys() <= samples.keys()
+        (compiling if first else frames).append(sum(step.milliseconds.values()))
+        for stage, spent in step.milliseconds.items():
+            samples.setdefault(stage, []).append(spent)
+    samples = {stage: spent[1:] or spent for stage, spent in samples.items()}
+    samples["frame"] = frames or compiling
     return {
         stage: Milliseconds(round(median(values), 2), round(mean(values), 2))
         for stage, values in samples.items()
     }
+
+
+def first_frame_seconds(steps: Sequence[StepResult]) -> float:
+    """What the first frame took, in which most kernels are compiled."""
+    return round(1e-3 * sum(steps[0].milliseconds.values()), 3) if steps else 0.0
 
 
 def versions() -> dict[str, str]:

@@ -64,7 +64,7 @@ class FrameCounts:
 
 @dataclass(frozen=True)
 class Milliseconds:
-    """Time that a stage takes for one frame."""
+    """Time that a stage takes for one frame, once its kernels are compiled."""
 
     median: float
     mean: float
@@ -77,6 +77,7 @@ class Seconds:
     frames: float
     mesh: float
     write: float
+    first_frame: float = 0.0  # of `frames`, the first one, with the compilation of kernels
 
 
 @dataclass(frozen=True)

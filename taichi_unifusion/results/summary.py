@@ -33,12 +33,15 @@ def summarize(record: RunRecord, files: Sequence[str], directory: Path) -> str:
         f"           {entry.frames} {entry.reason} (first: {entry.first})"
         for entry in frames.reasons
     ]
-    lines += ["", format_table(stages), "", format_table(maps), ""]
+    lines += ["", format_table(stages)]
+    if frames.used == 1:  # with more, the first is left out of the table
+        lines.append("kernels were compiled for this frame: further ones take a fraction of that")
+    lines += ["", format_table(maps), ""]
     if mesh:
         lines.append(f"mesh     {mesh.vertices:,} vertices, {mesh.triangles:,} triangles")
     lines += [
-        f"time     {seconds.frames:.1f} s for the frames, {seconds.mesh:.1f} s for the mesh, "
-        f"{seconds.write:.1f} s to write",
+        f"time     {seconds.frames:.1f} s for the frames ({seconds.first_frame:.1f} s for the first, which "
+        f"compiles kernels), {seconds.mesh:.1f} s for the mesh, {seconds.write:.1f} s to write",
         f"memory   {format_bytes(record.peak_memory_bytes)} at most, on {record.device_name}",
         f"results  {directory}: {', '.join(files)}",
     ]

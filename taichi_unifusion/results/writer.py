@@ -24,7 +24,7 @@ from ..rendering.preview import render_preview
 from ..run_log import RunResult
 from ..types import Mesh
 from .folder_writer import FolderWriter
-from .measure import measure_run
+from .measure import first_frame_seconds, measure_run
 from .property_files import looks_of, write_property_picture
 from .record import RunRecord, Seconds, Source, write_record
 from .run_folder import MESH_SUFFIXES, RunFolder
@@ -92,6 +92,7 @@ def write_results(
         _remove_others(writer, pipeline)
     seconds = Seconds(
         frames=round(run.seconds, 3),
+        first_frame=first_frame_seconds(run.steps),
         mesh=round(extracted - extracting, 3),
         write=round(time.perf_counter() - started - (extracted - extracting), 3),
     )
