@@ -30,8 +30,8 @@ class ExtractMesh:
         Path | None,
         arg(metavar="FILE", help_behavior_hint="(default: DIR/mesh.ply and DIR/mesh.glb)"),
     ] = None
-    """Where to write it: .ply, .glb or .obj; by default the meshes of single properties are written
-    again too.
+    """Where to write it: .ply, .glb or .obj; by default the meshes of single properties, the pictures
+    and the sizes in the record follow.
     """
     device: Device = "auto"
     """Where to compute."""
@@ -72,7 +72,7 @@ def extract_mesh(options: ExtractMesh) -> int:
         from ..results.property_files import property_meshes
 
         meshes.update(property_meshes(folder, mesh))
-    failures = []
+    failures: list[Exception] = []
     for file, shown in meshes.items():
         try:
             write_mesh(file, shown)
@@ -82,4 +82,10 @@ def extract_mesh(options: ExtractMesh) -> int:
             )
         except UniFusionError as error:  # the other file may still be written
             failures.append(error)
+    if not options.out:
+        from ..results.mesh_update import update_folder
+
+        updated = update_folder(folder, mesh)
+        print(f"{folder.path}: {', '.join(updated.files)} follow the new mesh")
+        failures += updated.failures
     return report(failures)

@@ -86,7 +86,9 @@ class OutputOptions:
     """Where the results of a run go, and what its settings begin with."""
 
     out: Annotated[Path, arg(metavar="DIR")]
-    """Folder for the results; made where it does not exist."""
+    """Folder for the results; made where it does not exist. The results of an earlier run in it are
+    replaced once this one is done.
+    """
     config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
     """YAML file of settings that differ from the defaults; options given here count more."""
     json: FlagCreatePairsOff[bool] = False

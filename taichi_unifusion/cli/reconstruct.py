@@ -64,6 +64,12 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     from ..results.writer import prepare_results, remove_temporaries
 
     folder = prepare_results(options.output.out)
+    if earlier := folder.earlier_run():
+        logger.warning(
+            "%s holds %s: this run replaces it when it is done; another --out keeps it",
+            folder.path,
+            earlier,
+        )
     with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
         return _fuse_and_write(recording, options, folder, stop, encoder)
 

@@ -16,6 +16,7 @@ from ..rendering.legend import draw_legend, property_mesh
 from ..rendering.look import Look, shown_range
 from ..rendering.preview import draw_preview
 from ..types import Mesh, Trajectory
+from .folder_writer import FolderWriter
 from .record import PropertyRecord, read_record
 from .run_folder import RunFolder
 
@@ -43,6 +44,26 @@ def property_meshes(folder: RunFolder, mesh: Mesh) -> dict[Path, Mesh]:
         for file in folder.property_meshes(name)
         if file.exists()
     }
+
+
+def redraw_property_pictures(
+    writer: FolderWriter, mesh: Mesh, trajectory: Trajectory | None
+) -> None:
+    """Draw again what pictures of single properties a results folder holds, of `mesh`."""
+    folder = writer.folder
+    pictures = {name: folder.property_picture(name) for name in mesh.attributes if name != "color"}
+    pictures = {name: picture for name, picture in pictures.items() if picture.exists()}
+    looks = _recorded_looks(folder) if pictures else {}
+    for name, picture in pictures.items():
+        look = looks.get(name, Look(range=None))
+        shown = property_mesh(mesh, name, look)
+        if "color" in shown.attributes:
+            writer.write(
+                picture,
+                lambda path, shown=shown, name=name, look=look: write_property_picture(
+                    path, shown, name, look, trajectory
+                ),
+            )
 
 
 def _recorded_looks(folder: RunFolder) -> Mapping[str, Look]:

@@ -135,6 +135,17 @@ class RunFolder:
         found |= {file for file in (self.answers, *segmented) if file.exists()}
         return tuple(sorted(found))
 
+    def earlier_run(self) -> str:
+        """What a further run would replace, in words; "" where there are neither maps nor a record."""
+        if not (self.maps or self.record.exists()):
+            return ""
+        held = [f"{'map' if len(self.maps) == 1 else 'maps'} {', '.join(self.maps)}"] * bool(
+            self.maps
+        )
+        held += ["a mesh"] * any(file.exists() for file in self.meshes)
+        held += ["answers"] * bool(self.asked)
+        return f"an earlier run ({'; '.join(held or ['no map'])})"
+
     @property
     def temporaries(self) -> tuple[Path, ...]:
         """What writing leaves behind where the process is ended at once."""

@@ -44,10 +44,12 @@ class Results:
 
 def prepare_results(directory: str | Path) -> RunFolder:
     """Make the folder; raises FileError if results cannot be written there, before any work is
-    spent on them.
+    spent on them. A run that fails leaves no empty folder in it.
     """
     folder = RunFolder(check_writable(directory))
     check_writable(folder.map_folder)
+    with suppress(OSError):  # it holds maps
+        folder.map_folder.rmdir()
     return folder
 
 
@@ -72,6 +74,7 @@ def write_results(
     in the folder that belong to this run and are there already.
     """
     folder, started = prepare_results(directory), time.perf_counter()
+    folder.map_folder.mkdir(exist_ok=True)
     writer = FolderWriter(folder, list(written))
     for file in folder.tracking_files:
         if file not in written:

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -371,8 +372,8 @@ def test_R6_a_folder_that_cannot_be_written_is_told_before_the_first_frame(
     assert str(target / "out") in error and "frame 1 of" not in error
 
 
-def test_a_folder_that_is_used_again_holds_one_run(made, recording, tmp_path):
-    """Maps, properties and answers of an earlier run go, other people's files stay."""
+def test_a_folder_that_is_used_again_holds_one_run(made, recording, tmp_path, capsys):
+    """Maps, properties and answers of an earlier run go, which is said; other people's files stay."""
     out = shutil.copytree(made, tmp_path / "out")
     shutil.copy(out / "maps" / "color.safetensors", out / "maps" / "style.safetensors")
     old = ["style.ply", "style.png", "query-sofa.ply", "query.json", "segmentation.ply"]
@@ -380,6 +381,19 @@ def test_a_folder_that_is_used_again_holds_one_run(made, recording, tmp_path):
         (out / name).write_text("of somebody")
     assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--out", str(out)]) == 0
     assert files_in(out) == sorted([*OUTPUTS, "notes.txt", "photo.png"])
+    (said,) = (line for line in capsys.readouterr().err.splitlines() if "earlier run" in line)
+    assert f"{out} holds an earlier run (maps color, style, surface; a mesh; answers)" in said
+
+
+def test_a_run_that_fails_leaves_an_earlier_one_alone_and_no_empty_folder(made, tmp_path):
+    blind = write_folder(
+        tmp_path / "blind", [replace(frame, depth=0 * frame.depth) for frame in make_frames(2)]
+    )
+    kept = shutil.copytree(made, tmp_path / "kept")
+    for out in (tmp_path / "new", kept):
+        assert cli.main(["reconstruct", "folder", str(blind), *FLAGS, "--out", str(out)]) == 2
+    assert list((tmp_path / "new").iterdir()) == []
+    assert files_in(kept) == OUTPUTS
 
 
 def test_one_failing_output_does_not_cost_the_others(recording, tmp_path, monkeypatch, capsys):
@@ -575,6 +589,20 @@ def test_mesh_extracts_again_finer(made, tmp_path, capsys):
         again.attributes["color"], before.attributes["color"], atol=SAME_COLOR
     )
     assert (copy / "mesh.glb").exists()
+
+
+def test_mesh_leaves_no_picture_or_number_of_the_old_mesh(made, tmp_path):
+    copy = shutil.copytree(made, tmp_path / "copy")
+    (copy / "preview.png").write_bytes(b"of the old mesh")
+    before = json.loads((copy / "metrics.json").read_text())
+    assert cli.main(["mesh", str(copy), "--resolution", "2", "--device", DEVICE]) == 0
+    mesh, after = read_mesh(copy / "mesh.ply"), json.loads((copy / "metrics.json").read_text())
+    assert (copy / "preview.png").read_bytes()[:4] == b"\x89PNG"
+    assert after["mesh"] == {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    assert after["mesh"] != before["mesh"] and after["files"].keys() == before["files"].keys()
+    assert after["files"]["mesh.ply"] == (copy / "mesh.ply").stat().st_size
+    changed = {name for name in before if before[name] != after[name]}
+    assert changed == {"mesh", "files"} and files_in(copy) == OUTPUTS
 
 
 def test_info_describes_a_folder_a_map_and_a_mesh(made, recording, capsys):

@@ -133,6 +133,7 @@ def test_the_run_can_be_repeated_from_its_configuration(made):
 
 def test_mesh_extracts_properties_again(made, capsys):
     before = read_mesh(made / "saliency.ply")
+    (made / "saliency.png").write_bytes(b"of the old mesh")
     assert cli.main(["mesh", str(made), "--resolution", "2", "--device", CONFIG.device]) == 0
     said = capsys.readouterr().out
     for name in ("mesh", "saliency", "infrared", "drawing"):
@@ -141,6 +142,7 @@ def test_mesh_extracts_properties_again(made, capsys):
     assert 0 < len(after.faces) < 0.5 * len(before.faces) and len(after.faces) == len(whole.faces)
     np.testing.assert_array_equal(after.attributes["saliency"], whole.attributes["saliency"])
     assert set(after.attributes) == {"color", "saliency"}
+    assert (made / "saliency.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_an_earlier_run_leaves_no_files_behind(made):
