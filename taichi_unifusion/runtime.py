@@ -7,11 +7,14 @@ the runtime that they were made under (`current()`) and refuse to go on under an
 from __future__ import annotations
 
 import ctypes
+import inspect
+import linecache
 import logging
 import os
 import platform
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
@@ -19,6 +22,7 @@ from functools import cache
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
+from types import FrameType, SimpleNamespace
 from typing import Any
 from weakref import WeakSet
 
@@ -221,7 +225,8 @@ def _quicken_tracing() -> None:
     """Let Taichi trace kernels in a third less time, which is what the first frame waits for.
 
     For every expression of a kernel it wraps the source line to 80 columns, for a message in case
-    of an error; and it looks up the source of every function anew wherever a kernel calls it.
+    of an error; and it looks up and wraps the source of every function anew wherever a kernel calls
+    it.
     """
     ti = import_taichi()
     kernel_impl, context = ti.lang.kernel_impl, ti.lang.ast.ast_transformer_utils
@@ -235,6 +240,7 @@ def _quicken_tracing() -> None:
     for name in ("getsourcefile", "getsourcelines"):
         if hasattr(kernel_impl, name):  # not in every build of Taichi
             setattr(kernel_impl, name, cache(getattr(kernel_impl, name)))
+    kernel_impl.textwrap = SimpleNamespace(fill=cache(textwrap.fill), dedent=textwrap.dedent)
 
 
 @contextmanager
@@ -268,7 +274,9 @@ def import_taichi() -> Any:
     os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
     name = os.environ.get("UNIFUSION_TAICHI") or "taichi"
     try:
-        taichi = import_module(name)
+        with _frames_read_quickly():
+            taichi = import_module(name)
+            taichi.lang.kernel_impl.inspect = SimpleNamespace(**vars(inspect))  # quick for good
     except (ImportError, OSError) as error:
         if "libX11" in str(error):
             raise MissingDependency(
@@ -282,6 +290,24 @@ def import_taichi() -> Any:
     if name != "taichi":
         sys.modules["taichi"] = taichi
     return taichi
+
+
+@contextmanager
+def _frames_read_quickly() -> Iterator[None]:
+    """While it is entered, `inspect.getframeinfo` reads a frame's line without going by every module
+    there is: Taichi asks for that line at each function that it decorates, its own included.
+    """
+
+    def read_frame(frame: FrameType, context: int = 1) -> inspect.Traceback:
+        file, number = frame.f_code.co_filename, frame.f_lineno
+        lines = [linecache.getline(file, number)]
+        return inspect.Traceback(file, number, frame.f_code.co_name, lines, 0)
+
+    before, inspect.getframeinfo = inspect.getframeinfo, read_frame
+    try:
+        yield
+    finally:
+        inspect.getframeinfo = before
 
 
 NO_DRIVER = "there is no NVIDIA driver (libcuda.so.1); install one"

@@ -1,5 +1,6 @@
 """Starting Taichi: what another process left behind does not slow it down."""
 
+import inspect
 import os
 import re
 import subprocess
@@ -8,9 +9,12 @@ import time
 
 import pytest
 import taichi as ti
+from places import DEVICE
 
 from taichi_unifusion import runtime
 from taichi_unifusion.errors import InputError
+
+GETFRAMEINFO = inspect.getframeinfo
 
 
 @pytest.mark.parametrize(("age", "stays"), [(1, True), (3600, False)])
@@ -96,3 +100,52 @@ def test_an_error_in_a_kernel_still_says_where_it_is():
     with pytest.raises(ti.TaichiNameError) as error:
         faulty()
     assert re.search(r'test_runtime.py", line \d+, in faulty:\n +return not_def', str(error.value))
+
+
+def test_what_taichi_reads_of_a_frame_is_what_python_says():
+    def said() -> tuple:
+        frame = sys._getframe(1)  # the line that calls
+        found = inspect.getframeinfo(frame)
+        return found.filename, found.function, [line.strip() for line in found.code_context or []]
+
+    with runtime._frames_read_quickly():
+        quickly = said()
+        assert inspect.getframeinfo is not GETFRAMEINFO
+    assert inspect.getframeinfo is GETFRAMEINFO
+    slowly = said()
+    assert quickly[:2] == slowly[:2]
+    assert (quickly[2], slowly[2]) == (["quickly = said()"], ["slowly = said()"])
+
+
+def test_methods_of_a_class_are_kernels_still():
+    """Taichi tells a method from a function by the line that runs when it decorates it."""
+    runtime.init(DEVICE)
+
+    @ti.data_oriented
+    class Counter:
+        def __init__(self) -> None:
+            self.seen = ti.field(ti.i32, 4)
+
+        @ti.func
+        def twice(self, n):
+            return 2 * n
+
+        @ti.kernel
+        def count(self):
+            for i in self.seen:
+                self.seen[i] = self.twice(i)
+
+    counter = Counter()
+    counter.count()
+    assert counter.seen.to_numpy().tolist() == [0, 2, 4, 6]
+
+
+def test_kernels_compiled_sooner_leave_the_settings_as_they_were():
+    runtime.init(DEVICE)
+    config = runtime.import_taichi().lang.impl.current_cfg()
+
+    @runtime.compiled_sooner()
+    def inside() -> bool:
+        return config.cfg_optimization
+
+    assert [inside(), config.cfg_optimization, inside()] == [False, True, False]
