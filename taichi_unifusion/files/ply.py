@@ -91,7 +91,7 @@ def _columns_of(mesh: Triangles) -> tuple[list[Column], list[str]]:
     for name, values in mesh.attributes.items():
         if values.ndim != 2:
             raise InputError(f"mesh: attribute '{name}' must be (V, c), got {values.shape}")
-        if name == "color":
+        if name == "color" and colors is not None:
             columns.append(("u1", ("red", "green", "blue"), colors))
             continue
         if not re.fullmatch(r"[!-~]+", name):
