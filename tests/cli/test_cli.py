@@ -223,6 +223,24 @@ def test_an_unknown_key_names_the_right_ones(tmp_path, capsys):
     assert not (tmp_path / "o").exists()
 
 
+def test_a_command_leaves_the_processor_to_taichi():
+    """NumPy reads it when it is imported, so nothing may import it before; users may say else."""
+    code = (
+        "import taichi_unifusion.cli, os, sys; before = 'numpy' in sys.modules;"
+        "import taichi_unifusion.cli.main; print(before, os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    for asked, used in ((None, "1"), ("3", "3")):
+        environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=environment | ({"OPENBLAS_NUM_THREADS": asked} if asked else {}),
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert done.stdout.split() == ["False", used]
+
+
 # --- reconstruct ----------------------------------------------------------------------------------------------------
 
 
