@@ -16,7 +16,7 @@ import yaml
 
 from .errors import ConfigError, InputError, convert, did_you_mean, shortened
 from .files.strict_yaml import read_yaml
-from .maps.settings import MAX_RESOLUTION, FeatureSettings, PropertySettings, SurfaceSettings
+from .maps.settings import MAX_RESOLUTION, MAX_WINDOW, FeatureSettings, PropertySettings, SurfaceSettings
 from .preprocessing import PreprocessSettings
 from .tracking.base import TrackingSettings
 
@@ -54,6 +54,10 @@ class Config:
     """Which pixels become points."""
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     """How poses are found and refined, with --tracking internal or rgbd."""
+    window: int = 10
+    """Consecutive frames that are summed up before they are fused; 1 fuses each by itself, as
+    published, and is slower.
+    """
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     """The map of the surface."""
     color: PropertySettings = field(default_factory=PropertySettings)
@@ -72,6 +76,8 @@ class Config:
     def __post_init__(self) -> None:
         if self.threads < 0:
             raise InputError(f"threads: must not be negative, got {self.threads}")
+        if not 1 <= self.window <= MAX_WINDOW:
+            raise InputError(f"window: must lie in 1..{MAX_WINDOW} frames, got {self.window}")
 
 
 def load_config(path: str | Path, base: Config | None = None) -> Config:

@@ -8,7 +8,8 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -18,10 +19,12 @@ from .config import Config
 from .datasets.loading import load_ahead
 from .errors import FrameError, InputError, UniFusionError
 from .language.source import FeatureSource
-from .maps import BaseMap, Integration, PropertyMap, SurfaceMap
+from .kernels.patches import Patches
+from .maps import BaseMap, FeatureMap, Integration, PropertyMap, SurfaceMap
 from .maps.property_group import group_maps
+from .maps.window import WindowFusion
 from .networks.encoders import ImageEncoder
-from .preprocessing import PreprocessSettings, preprocess
+from .preprocessing import PreprocessSettings, find_patches, invert_depth, preprocess
 from .properties import SurfaceProperty, make_property
 from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult
 from .types import Frame, Mesh, PinholeCamera
@@ -73,6 +76,10 @@ class Pipeline:
         for source in made:  # maps of features wait for the first features
             self.maps[source.name] = source.make_map()
         self.groups = group_maps(self.maps.values())
+        self.fusion = WindowFusion(config.window)
+        finest = min(each.voxel_size for each in self.maps.values())
+        patch_size = min(config.preprocess.patch_size, finest / 2)
+        self._preprocess = replace(config.preprocess, patch_size=patch_size)
 
     @property
     def properties(self) -> dict[str, PropertyMap]:
@@ -93,17 +100,49 @@ class Pipeline:
             live.warm = True
         frame, lacking = self._with_properties(frame, clock)
         with clock.stage("preprocess"):
-            cloud = preprocess(frame, self.config.preprocess)
-        if len(cloud) == 0:
+            images, view = self.fusion.place(frame)
+            inverse = invert_depth(frame, self._preprocess, images, view)
+        with clock.stage("sum"):
+            find = partial(find_patches, frame, self._preprocess, inverse, T_world_camera)
+            reach = self._preprocess.depth_max * frame.camera.longest_ray
+            patches, touched = self.fusion.add(frame, find, reach, self.groups, bool(frame.features))
+        if patches.total == 0:
             raise EmptyFrame(f"{frame.label}: {_why_empty(frame, self.config.preprocess)}")
-        with clock.stage("transform"):
-            cloud = cloud.transformed(T_world_camera)
+        for piece in self.fusion.due():
+            with clock.stage(piece.name):
+                piece.work()
+        done = {
+            name: Integration(patches.pixels, voxels, len(self.maps[name].grid))
+            for name, voxels in touched.items()
+        }
+        done |= self._integrate_alone(frame, patches, clock)
+        return StepResult(
+            frame.index, frame.name, patches.pixels, done, clock.milliseconds, lacking
+        )
+
+    def _integrate_alone(
+        self, frame: Frame, patches: Patches, clock: StageClock
+    ) -> dict[str, Integration]:
+        """Fuse a frame into the maps that do not take averages of several frames."""
         done: dict[str, Integration] = {}
-        for group in self.groups:
+        for name, each in self.maps.items():
+            if isinstance(each, FeatureMap) and each.wants(frame):
+                with clock.stage(name):
+                    done[name] = each.integrate_patches(patches)
+        alone = [group for group in self.groups if not group.sums_up]
+        if alone:
+            with clock.stage("points"):
+                settings = replace(self._preprocess, patch_size=0.0)
+                cloud = preprocess(frame, settings).transformed(frame.require_pose())
+        for group in alone:
             if names := group.names_in(cloud):
                 with clock.stage(" + ".join(names)):
                     done |= group.integrate(cloud)
-        return StepResult(frame.index, frame.name, len(cloud), done, clock.milliseconds, lacking)
+        return done
+
+    def flush(self) -> None:
+        """Fuse the frames of the last window. Reading, saving or changing a map does so by itself."""
+        self.fusion.flush()
 
     def _with_properties(self, frame: Frame, clock: StageClock) -> tuple[Frame, dict[str, str]]:
         """The frame with an image of every property (f_im, Fig. 6), and by name why one cannot be
@@ -159,6 +198,7 @@ class Pipeline:
             on_frame(i + 1, len(sequence))
             if failure:
                 break
+        self.flush()
         return log.result(interrupted, failure)
 
     def extract_mesh(self, resolution: int | None = None) -> Mesh:
@@ -208,6 +248,7 @@ def warm_up(config: Config | None = None) -> None:
     color = np.full((48, 64, 3), 128, np.uint8)
     camera = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
     pipeline.step(Frame(depth, camera, color, np.eye(4)))
+    pipeline.flush()
     pipeline.extract_mesh()
 
 
@@ -224,7 +265,8 @@ class StageClock:
         yield
         if self.synchronize:
             runtime.synchronize()
-        self.milliseconds[name] = 1e3 * (time.perf_counter() - start)
+        spent = 1e3 * (time.perf_counter() - start)
+        self.milliseconds[name] = self.milliseconds.get(name, 0.0) + spent
 
 
 def _why_empty(frame: Frame, settings: PreprocessSettings) -> str:

@@ -1,17 +1,22 @@
-"""Frame -> PointCloud: readings in range, no flying pixels, normals towards the camera (Sec. IV-B,
-V-A).
+"""Frame -> patches on the device, or a PointCloud: readings in range, normals towards the camera
+(Sec. IV-B, V-A).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import runtime
 from .errors import InputError
+from .runtime import DeviceArray
 from .types import Frame, ImageView, PointCloud
+
+if TYPE_CHECKING:
+    from .kernels.patches import Patches, Target, Targets, Values
 
 FARTHEST = 1e4  # [m] readings beyond it are dropped
 
@@ -28,26 +33,26 @@ class PreprocessSettings:
     """Neighbouring pixels whose depths differ by more than this share of the depth lie on different
     surfaces.
     """
-    edge_support: int = 1
-    """How many of a pixel's 8 neighbours must lie on its surface; fewer: a flying pixel. 0 keeps
-    all.
-    """
     normal_radius: int = 2
     """Radius in pixels of the window from which a normal is estimated."""
     max_angle: float = 80.0
     """Pixels seen at a more grazing angle than this, in degrees between ray and normal, are left
     out.
     """
+    patch_size: float = 0.0125
+    """Two by two pixels that lie on one surface and span at most this, in metres, become one point;
+    half the finest voxel at most. 0: every pixel is a point."""
 
     def __post_init__(self) -> None:
         if not 0 < self.depth_min < self.depth_max:
             raise InputError(
                 f"preprocess: need 0 < depth_min < depth_max, got {self.depth_min} and {self.depth_max}"
             )
-        if not 0 < self.edge_jump < 1 or not 0 <= self.edge_support <= 8:
+        if not 0 < self.edge_jump < 1:
+            raise InputError(f"preprocess: need 0 < edge_jump < 1, got {self.edge_jump}")
+        if not 0 <= self.patch_size < float("inf"):
             raise InputError(
-                f"preprocess: need 0 < edge_jump < 1 and edge_support in 0..8, got {self.edge_jump} and "
-                f"{self.edge_support}"
+                f"preprocess: patch_size must be a number from 0, got {self.patch_size}"
             )
         if not 1 <= self.normal_radius <= 20 or not 0 < self.max_angle <= 90:
             raise InputError(
@@ -58,99 +63,215 @@ class PreprocessSettings:
 
 def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> PointCloud:
     """Points, normals, colour and property images of a frame's usable pixels, in camera
-    coordinates, row by row.
+    coordinates; where pixels were put together, `counts` says how many.
 
     A frame without a usable pixel gives an empty cloud.
     """
-    live = runtime.current()
-    from .kernels import images as kernels
-
-    settings = settings or PreprocessSettings()
-    depth, inverse, normals, pixels = _scratch(live, frame.depth.shape)
-    _find_normals(frame, settings, depth, inverse, normals)
-    counts = np.empty(-(-frame.depth.size // kernels.PIXEL_CHUNK), np.int32)
-    kernels.count_points(normals, counts)
-    runtime.synchronize()
-    total = int(counts.sum())
-    points, point_normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)
-    view = _view(frame, settings)
-    if total == 0:
-        empty = {name: np.empty((0, c), np.float32) for name, c in _channels(frame).items()}
-        return PointCloud(points, point_normals, empty, view)
-    kernels.unproject(
-        depth,
-        normals,
-        frame.camera.intrinsics,
-        (np.cumsum(counts) - counts).astype(np.int32),
-        points,
-        point_normals,
-        pixels,
+    runtime.current()
+    settings, views = settings or PreprocessSettings(), view_images(1, frame)
+    patches = find_patches(frame, settings, invert_depth(frame, settings, views, 0), np.eye(4))
+    found = patches.found.to_numpy()
+    places = np.arange(len(found) * patches.slots).reshape(len(found), patches.slots)
+    rows = places[np.arange(patches.slots) < found[:, None]]
+    attributes = {}
+    for name, each in patches.attributes.items():
+        attributes[name] = each.values.to_numpy()[rows]
+        if not each.whole:  # maps leave out points whose value is not finite
+            attributes[name][each.counts.to_numpy()[rows] == 0] = np.nan
+    return PointCloud(
+        patches.points.to_numpy()[rows],
+        patches.normals.to_numpy()[rows],
+        attributes,
+        ImageView(views.to_numpy()[0], frame.camera),
+        frame.features,
+        patches.counts.to_numpy()[rows],
     )
-    attributes = {name: np.empty((total, c), np.float32) for name, c in _channels(frame).items()}
-    for name, values in attributes.items():
-        if name == "color" and name not in frame.images:
-            kernels.sample_color(pixels, np.ascontiguousarray(frame.color), values)
-        else:
-            kernels.sample_image(pixels, np.ascontiguousarray(frame.images[name]), values)
-    return PointCloud(points, point_normals, attributes, view, frame.features)
 
 
-def _view(frame: Frame, settings: PreprocessSettings) -> ImageView:
-    """All readings of a frame: those too far for a point still show that the space in front of them
-    is free.
+def invert_depth(
+    frame: Frame, settings: PreprocessSettings, views: DeviceArray, view: int
+) -> DeviceArray:
+    """1/z (H, W) of a frame's readings in range, 0 elsewhere, on loan until the next frame.
+
+    Its depth image becomes image `view` of `views` (K, H, W), with all readings: those too far for
+    a point still show that the space in front of them is free.
     """
-    from .kernels import images as kernels
+    from .kernels.patches import clip_and_invert
 
-    depth = np.empty_like(frame.depth)
-    kernels.clip_depth(np.ascontiguousarray(frame.depth), settings.depth_min, FARTHEST, depth)
-    return ImageView(depth, frame.camera)
+    inverse = _image("inverse depth", frame)
+    clip_and_invert(
+        np.ascontiguousarray(frame.depth),
+        settings.depth_min,
+        settings.depth_max,
+        FARTHEST,
+        view,
+        views,
+        inverse,
+    )
+    return inverse
+
+
+def find_patches(
+    frame: Frame,
+    settings: PreprocessSettings,
+    inverse: DeviceArray,
+    T_world_camera: NDArray[np.float64],
+    targets: Targets | None = None,
+    write: bool = True,
+) -> Patches:
+    """A frame's usable pixels as patches in the world, on the device, with what they carry; summed
+    up on the way in the cells of `targets`. Without `write` they are only summed up.
+    """
+    from .kernels import patches as kernels
+
+    targets = targets or kernels.Targets()
+    surface, color = targets.surface, targets.color
+    found, counts, places = _column("found", frame), _column("counts", frame), _column("at", frame)
+    points, normals = _rows("points", frame, 3), _rows("normals", frame, 3)
+    spread = settings.patch_size * min(frame.camera.fx, frame.camera.fy) / 2  # of two pixels
+    totals = np.array(
+        [0, 0, surface.blocks if surface else 0, color.blocks if color else 0], np.int32
+    )
+    image = np.ascontiguousarray(frame.color) if color else np.zeros((1, 1, 3), np.uint8)
+    kernels.make_patches(
+        inverse,
+        image,
+        frame.camera.intrinsics,
+        T_world_camera[:3],
+        settings.normal_radius,
+        (
+            settings.edge_jump,
+            float(np.cos(np.radians(settings.max_angle))),
+            1.0 / spread if spread > 0 else float("inf"),
+        ),
+        kernels.Sinks(write, surface.sink if surface else None, color.sink if color else None),
+        (
+            targets.sign,
+            targets.frame,
+            surface.stamp if surface else 0,
+            color.stamp if color else 0,
+            *targets.first,
+        ),
+        totals,
+        (surface or _nothing()).keys,
+        (surface or _nothing()).sums,
+        (color or _nothing()).keys,
+        (color or _nothing()).sums,
+        kernels.PatchPack(
+            found=found, points=points, normals=normals, counts=counts, places=places
+        ),
+    )
+    names = _attributes(frame) if write else []
+    attributes = {name: _averages(name, frame, found, places, counts) for name in names}
+    runtime.synchronize()
+    return kernels.Patches(
+        kernels.slots_of_run(),
+        found,
+        points,
+        counts,
+        normals,
+        attributes,
+        int(totals[0]),
+        int(totals[1]),
+        (int(totals[2]), int(totals[3])),
+        {name: image.transformed(T_world_camera) for name, image in frame.features.items()},
+    )
+
+
+def _nothing() -> Target:
+    """Arrays in the place of a target that there is none of."""
+    import taichi as ti
+
+    from .kernels.patches import Sink, Target
+
+    def make() -> Target:
+        keys, sums = ti.ndarray(ti.i32, (1, 5)), ti.ndarray(ti.i64, (1, 1, 1))
+        return Target(Sink(None, 0.0), 0, 0, keys, sums)
+
+    return runtime.current().arena.exact("no target", make, ())
+
+
+def view_images(count: int, frame: Frame) -> DeviceArray:
+    """Room (count, H, W) on the device for depth images of the size of a frame's."""
+    import taichi as ti
+
+    return ti.ndarray(ti.f32, (count, *frame.depth.shape))
 
 
 def normal_image(frame: Frame, settings: PreprocessSettings | None = None) -> NDArray[np.float32]:
     """Unit normals (H, W, 3) towards the camera, in camera coordinates, of a frame's usable pixels;
     0 elsewhere.
     """
-    depth, inverse, normals, _ = _scratch(runtime.current(), frame.depth.shape)
-    _find_normals(frame, settings or PreprocessSettings(), depth, inverse, normals)
-    return normals.to_numpy()
+    runtime.current()
+    from .kernels.images import clip_depth, estimate_normals
 
-
-def _find_normals(frame: Frame, settings: PreprocessSettings, depth, inverse, normals) -> None:
-    """Fill the scratch images from the depth image."""
-    from .kernels import images as kernels
-
-    kernels.clip_depth(
+    settings = settings or PreprocessSettings()
+    depth = np.empty_like(frame.depth)
+    clip_depth(
         np.ascontiguousarray(frame.depth), settings.depth_min, settings.depth_max, depth
     )
-    kernels.drop_flying_pixels(depth, settings.edge_jump, settings.edge_support, inverse)
-    kernels.estimate_normals(
-        inverse,
+    normals = np.empty((*depth.shape, 3), np.float32)
+    estimate_normals(
+        np.divide(1.0, depth, where=depth > 0, out=np.zeros_like(depth)),
         frame.camera.intrinsics,
         settings.normal_radius,
         settings.edge_jump,
         float(np.cos(np.radians(settings.max_angle))),
         normals,
     )
+    return normals
 
 
-def _scratch(live: runtime.Runtime, shape: tuple[int, int]) -> tuple:
-    """Images that only the kernels need: depth, inverse depth, normals and pixels of the points;
-    kept on the device by size.
-    """
+def _averages(
+    name: str, frame: Frame, found: DeviceArray, places: DeviceArray, counts: DeviceArray
+) -> Values:
+    """The mean of an image over the pixels of each patch."""
+    from .kernels import patches as kernels
+
+    if name not in frame.images:
+        values = _rows(name, frame, 3)
+        kernels.average_color(found, places, np.ascontiguousarray(frame.color), values)
+        return kernels.Values(values, counts)
+    image = np.ascontiguousarray(frame.images[name])
+    values, known = _rows(name, frame, image.shape[2]), _column(f"{name} known", frame)
+    kernels.average_image(found, places, image, values, known)
+    whole = name in frame.carried
+    return kernels.Values(values, counts if whole else known, whole)
+
+
+def _attributes(frame: Frame) -> list[str]:
+    """What the patches of a frame carry."""
+    color = ["color"] if frame.color is not None and "color" not in frame.images else []
+    return [*color, *frame.images]
+
+
+def _image(use: str, frame: Frame) -> DeviceArray:
     import taichi as ti
 
-    def make() -> tuple:
-        return (
-            ti.ndarray(ti.f32, shape),
-            ti.ndarray(ti.f32, shape),
-            ti.ndarray(ti.f32, (*shape, 3)),
-            ti.ndarray(ti.i32, (shape[0] * shape[1], 2)),
-        )
-
-    return live.arena.exact("images of a frame", make, shape)
+    shape = frame.depth.shape
+    return runtime.current().arena.exact(use, lambda: ti.ndarray(ti.f32, shape), shape)
 
 
-def _channels(frame: Frame) -> dict[str, int]:
-    """Channels of every attribute that the cloud of a frame gets."""
-    channels = {name: image.shape[2] for name, image in frame.images.items()}
-    return channels if frame.color is None else {"color": 3, **channels}
+def _rows(use: str, frame: Frame, columns: int) -> DeviceArray:
+    """A row for every place of a patch."""
+    import taichi as ti
+
+    from .kernels.patches import runs_of, slots_of_run
+
+    shape = (runs_of(*frame.depth.shape) * slots_of_run(), columns)
+    return runtime.current().arena.exact(
+        f"patches: {use}", lambda: ti.ndarray(ti.f32, shape), shape
+    )
+
+
+def _column(use: str, frame: Frame) -> DeviceArray:
+    """A whole number for every place of a patch; of `found`, for every run."""
+    import taichi as ti
+
+    from .kernels.patches import runs_of, slots_of_run
+
+    runs = runs_of(*frame.depth.shape)
+    shape = (runs if use == "found" else runs * slots_of_run(),)
+    return runtime.current().arena.exact(
+        f"patches: {use}", lambda: ti.ndarray(ti.i32, shape), shape
+    )

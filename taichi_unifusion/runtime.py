@@ -18,6 +18,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from io import StringIO
@@ -82,14 +83,26 @@ class Arena:
             self._arrays[key] = make()
         return self._arrays[key]
 
-    def next_turn(self) -> int:
+    def next_turn(self) -> Loan:
         """Begin a turn: all loans of earlier turns are over."""
         self._turn += 1
-        return self._turn
+        return Loan(self, self._turn)
 
-    def check_loan(self, turn: int | None) -> None:
-        """Raise RuntimeStateError where what was borrowed in `turn` may have been overwritten."""
-        if turn is not None and turn != self._turn:
+    def is_over(self, turn: int) -> bool:
+        """Whether what was borrowed in `turn` may have been overwritten."""
+        return turn != self._turn
+
+
+@dataclass(frozen=True)
+class Loan:
+    """What was borrowed in one turn of an arena."""
+
+    arena: Arena
+    turn: int
+
+    def check(self) -> None:
+        """Raise RuntimeStateError where it is over."""
+        if self.arena.is_over(self.turn):
             raise RuntimeStateError(
                 "this local LIM is no longer there: another cloud was encoded since; fuse it "
                 "before that, or keep local.copy()"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,13 @@ class PinholeCamera:
             (self.cx + 0.5) / factor - 0.5,
             (self.cy + 0.5) / factor - 0.5,
         )
+
+    @property
+    def longest_ray(self) -> float:
+        """Length of the longest ray through a pixel, with z = 1."""
+        x = max(self.cx, self.width - 1 - self.cx) / self.fx
+        y = max(self.cy, self.height - 1 - self.cy) / self.fy
+        return float(np.sqrt(1 + x * x + y * y))
 
     def rays(self, u: NDArray | None = None, v: NDArray | None = None) -> NDArray[np.float64]:
         """Directions (..., 3) with z = 1 through the pixels at columns u and rows v; without them
@@ -227,6 +235,19 @@ class Frame:
                 f"{self.depth.shape[1]}x{self.depth.shape[0]}; register or resize one of them"
             )
 
+    @cached_property
+    def carried(self) -> frozenset[str]:
+        """What a pixel carries; "NAME?" for an image in which not all values are finite."""
+        color = ["color"] if self.color is not None and "color" not in self.images else []
+        # one pass: a sum is finite only if all its terms are
+        marks = {name: "" if np.isfinite(x.sum()) else "?" for name, x in self.images.items()}
+        return frozenset(color).union(name + mark for name, mark in marks.items())
+
+    @property
+    def attributes(self) -> frozenset[str]:
+        """Names of what a pixel carries."""
+        return frozenset(name.removesuffix("?") for name in self.carried)
+
     def require_pose(self) -> NDArray[np.float64]:
         """T_world_camera; raises PoseError where there is none."""
         if self.T_world_camera is None:
@@ -274,6 +295,7 @@ class PointCloud:
     view: ImageView | None = None
     # (h, w, c) images that see these points; pixels that are not finite are left out
     features: Mapping[str, ImageView] = field(default_factory=dict)
+    counts: NDArray[np.int32] | None = None  # (N,) pixels that each point is the mean of; None: one
 
     def __post_init__(self) -> None:
         for name, array, columns in (
@@ -304,6 +326,13 @@ class PointCloud:
         )
         if self.normals is not None:
             object.__setattr__(self, "normals", np.ascontiguousarray(self.normals))
+        if self.counts is not None:
+            if self.counts.shape != (len(self.points),) or self.counts.dtype != np.int32:
+                raise InputError(
+                    f"point cloud: counts must be ({len(self.points)},) int32, got "
+                    f"{self.counts.shape} {self.counts.dtype}"
+                )
+            object.__setattr__(self, "counts", np.ascontiguousarray(self.counts))
         if self.view is not None and (
             self.view.values.ndim != 2 or not np.isfinite(self.view.values.sum())
         ):
@@ -322,6 +351,7 @@ class PointCloud:
             points=self.points[rows],
             normals=None if self.normals is None else self.normals[rows],
             attributes={name: values[rows] for name, values in self.attributes.items()},
+            counts=None if self.counts is None else self.counts[rows],
         )
 
     def transformed(self, T_b_a: NDArray) -> PointCloud:

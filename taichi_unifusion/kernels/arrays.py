@@ -12,6 +12,7 @@ Masks2 = ti.types.ndarray(dtype=ti.u32, ndim=2)
 Votes2 = ti.types.ndarray(dtype=ti.i8, ndim=2)
 Bytes1 = ti.types.ndarray(dtype=ti.u8, ndim=1)
 Bytes2 = ti.types.ndarray(dtype=ti.u8, ndim=2)
+Bytes3 = ti.types.ndarray(dtype=ti.u8, ndim=3)
 Rows2 = ti.types.ndarray(ndim=2)  # of any type
 
 

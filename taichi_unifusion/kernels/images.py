@@ -6,11 +6,10 @@ may drop a test for NaN.
 
 import taichi as ti
 
-from .arrays import Floats2, Floats3, Ints1, Ints2, row3
-from .camera import Intrinsics, Pose, lift, move, ray
+from .arrays import Floats2, Floats3, row3
+from .camera import Intrinsics, Pose, move, ray
 
-Bytes3 = ti.types.ndarray(dtype=ti.u8, ndim=3)
-PIXEL_CHUNK = 64  # pixels that one thread compacts
+NARROW_PAIRS = 4  # of direct neighbours, that say as much as one pair at radius 2
 
 
 def segment_length() -> int:
@@ -75,39 +74,61 @@ def drop_flying_pixels(
 
 
 @ti.func
+def slope_along(
+    inverse: ti.template(),
+    v: ti.i32,
+    u: ti.i32,
+    dv: ti.i32,
+    du: ti.i32,
+    step: ti.i32,
+    radius: ti.template(),
+    near: ti.f32,
+):
+    """Mean slope of 1/z along (dv, du), from pairs of pixels `step` to both sides of a line through
+    (v, u) across it, all on its surface; and how many pairs.
+    """
+    q, along, pairs = inverse[v, u], 0.0, 0.0
+    for i in range(-radius, radius + 1):
+        # across the direction is (du, dv)
+        row, column = v + i * du, u + i * dv
+        ahead = inverse[row + step * dv, column + step * du]
+        behind = inverse[row - step * dv, column - step * du]
+        together = ti.max(ti.abs(ahead - q), ti.abs(behind - q)) < near
+        along += ti.select(together, ahead - behind, 0.0)
+        pairs += ti.select(together, 1.0, 0.0)
+    return along / (2.0 * step * ti.max(pairs, 1.0)), pairs
+
+
+@ti.func
 def inverse_depth_slope(
     inverse: ti.template(), v: ti.i32, u: ti.i32, radius: ti.template(), jump: ti.f32
 ):
-    """Least-squares slopes of 1/z by u and v over a window, from pairs of pixels on opposite sides
-    of (v, u) and on its surface.
+    """Slopes of 1/z by u and v in a window around (v, u), and whether they are known.
 
-    A plane has an inverse depth that is linear in the image. Also returns the smaller sum of
-    squares of the two fits.
+    A plane has an inverse depth that is linear in the image. Pairs of pixels on opposite edges of
+    the window tell most of what all pairs do; on things so thin that there is none, pairs of direct
+    neighbours stand in, if they are NARROW_PAIRS.
     """
-    q = inverse[v, u]
-    near = jump * q
-    along_u, along_v, square_u, square_v = 0.0, 0.0, 0.0, 0.0
+    near = jump * inverse[v, u]
+    slope_u, slope_v, known = 0.0, 0.0, False
     if (
         v >= radius
         and u >= radius
         and v < inverse.shape[0] - radius
         and u < inverse.shape[1] - radius
     ):
-        for i in range(-radius, radius + 1):
-            for k in ti.static(range(1, radius + 1)):
-                right, left = inverse[v + i, u + k], inverse[v + i, u - k]
-                below, above = inverse[v + k, u + i], inverse[v - k, u + i]
-                with_u = ti.max(ti.abs(right - q), ti.abs(left - q)) < near
-                with_v = ti.max(ti.abs(below - q), ti.abs(above - q)) < near
-                along_u += ti.select(with_u, k * (right - left), 0.0)
-                square_u += ti.select(with_u, 2.0 * k * k, 0.0)
-                along_v += ti.select(with_v, k * (below - above), 0.0)
-                square_v += ti.select(with_v, 2.0 * k * k, 0.0)
-    return (
-        along_u / ti.max(square_u, 1.0),
-        along_v / ti.max(square_v, 1.0),
-        ti.min(square_u, square_v),
-    )
+        slope_u, pairs_u = slope_along(inverse, v, u, 0, 1, radius, radius, near)
+        slope_v, pairs_v = slope_along(inverse, v, u, 1, 0, radius, radius, near)
+        known = pairs_u > 0 and pairs_v > 0
+        if not known:
+            known = True
+            if pairs_u == 0:
+                slope_u, pairs_u = slope_along(inverse, v, u, 0, 1, 1, radius, near)
+                known = pairs_u >= NARROW_PAIRS
+            if pairs_v == 0:
+                slope_v, pairs_v = slope_along(inverse, v, u, 1, 0, 1, radius, near)
+                known = known and pairs_v >= NARROW_PAIRS
+    return slope_u, slope_v, known
 
 
 @ti.kernel
@@ -123,17 +144,17 @@ def estimate_normals(
 ):
     height, width = inverse.shape[0], inverse.shape[1]
     for v2, u2 in ti.ndrange((height + 1) // 2, (width + 1) // 2):
-        slope_u, slope_v, found, of = 0.0, 0.0, 0.0, 0.0
+        slope_u, slope_v, known, of = 0.0, 0.0, False, 0.0
         for part in range(4):  # a quad of pixels shares its slopes where it lies on one surface
             v, u = v2 * 2 + part // 2, u2 * 2 + part % 2
             if v < height and u < width:
                 q = inverse[v, u]
                 n = ti.Vector([0.0, 0.0, 0.0])
                 if q > 0:
-                    if found == 0.0 or ti.abs(q - of) > 0.5 * jump * q:
-                        slope_u, slope_v, found = inverse_depth_slope(inverse, v, u, radius, jump)
+                    if not known or ti.abs(q - of) > 0.5 * jump * q:
+                        slope_u, slope_v, known = inverse_depth_slope(inverse, v, u, radius, jump)
                         of = q
-                    if found >= 2 * radius * radius:
+                    if known:
                         along_z = q - slope_u * (u - K[2]) - slope_v * (v - K[3])
                         m = ti.Vector([slope_u * K[0], slope_v * K[1], along_z]) / q
                         # m . ray = 1
@@ -141,73 +162,6 @@ def estimate_normals(
                             n = -m.normalized()
                 for d in ti.static(range(3)):
                     normals[v, u, d] = n[d]
-
-
-@ti.kernel
-def count_points(
-    # in:
-    normals: Floats3,  # (H, W, 3)
-    # out:
-    counts: Ints1,  # (H W / PIXEL_CHUNK,) pixels with a normal
-):
-    width, size = normals.shape[1], normals.shape[0] * normals.shape[1]
-    for chunk in range(counts.shape[0]):
-        count = 0
-        for p in range(chunk * PIXEL_CHUNK, ti.min((chunk + 1) * PIXEL_CHUNK, size)):
-            count += ti.cast(normals[p // width, p % width, 2] != 0, ti.i32)
-        counts[chunk] = count
-
-
-@ti.kernel
-def unproject(
-    # in:
-    depth: Floats2,  # (H, W) [m]
-    normals: Floats3,  # (H, W, 3)
-    K: Intrinsics,
-    starts: Ints1,  # (H W / PIXEL_CHUNK,) first point of each chunk
-    # out:
-    points: Floats2,  # (N, 3) camera [m]
-    point_normals: Floats2,  # (N, 3)
-    pixels: Ints2,  # (N, 2) row and column
-):
-    width, size = depth.shape[1], depth.shape[0] * depth.shape[1]
-    for chunk in range(starts.shape[0]):
-        n = starts[chunk]
-        for p in range(chunk * PIXEL_CHUNK, ti.min((chunk + 1) * PIXEL_CHUNK, size)):
-            v, u = p // width, p % width
-            z = depth[v, u]
-            if normals[v, u, 2] != 0:
-                x = lift(u, v, z, K)
-                for d in ti.static(range(3)):
-                    points[n, d], point_normals[n, d] = x[d], normals[v, u, d]
-                pixels[n, 0], pixels[n, 1] = v, u
-                n += 1
-
-
-@ti.kernel
-def sample_color(
-    # in:
-    pixels: Ints2,  # (N or more, 2)
-    color: Bytes3,  # (H, W, 3)
-    # out:
-    values: Floats2,  # (N, 3) in [0, 1]
-):
-    for n in range(values.shape[0]):
-        for c in ti.static(range(3)):
-            values[n, c] = ti.cast(color[pixels[n, 0], pixels[n, 1], c], ti.f32) * (1.0 / 255.0)
-
-
-@ti.kernel
-def sample_image(
-    # in:
-    pixels: Ints2,  # (N or more, 2)
-    image: Floats3,  # (H, W, c)
-    # out:
-    values: Floats2,  # (N, c)
-):
-    for n in range(values.shape[0]):
-        for c in range(values.shape[1]):
-            values[n, c] = image[pixels[n, 0], pixels[n, 1], c]
 
 
 @ti.kernel

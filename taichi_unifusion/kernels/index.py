@@ -1,8 +1,8 @@
-"""Voxel index: which voxels exist, and which of them the current frame touches (Sec. IV-A).
+"""Voxel index: which voxels exist, and which of them the open window touches (Sec. IV-A).
 
-A *voxel* is addressed by its integer triple; a *block* is a voxel touched by the current frame,
-addressed by a number that is valid for that frame only; a *slot* is the place of a voxel's data in
-the map's pools.
+A *voxel* is addressed by its integer triple; a *block* is a voxel touched by the frames that are
+summed now, addressed by a number that is valid until these are fused; a *slot* is the place of a
+voxel's data in the map's pools.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ class Index:
     """The fields of one map's index tree, as one compile-time argument."""
 
     slot: ti.Field  # slot plus one: 0 where there is no voxel
-    stamp: ti.Field  # frame that last touched the voxel
-    block: ti.Field  # its block number in that frame
+    stamp: ti.Field  # of the last frames to touch the voxel, which were summed together
+    block: ti.Field  # its block number among theirs, plus one; 0 when they are fused
     leaf_parent: ti.SNode  # the node above the leaves
 
 
@@ -58,32 +58,39 @@ def voxel_of(x: ti.template()):
 def touch(
     # in:
     ijk: ti.template(),
-    frame: ti.i32,
+    stamp: ti.i32,
     # in and out:
     index: ti.template(),
     keys: ti.template(),
     counters: ti.template(),
 ):
-    """Give voxel ijk a block number in this frame, once; counters[0] counts blocks, also those
-    beyond the room in `keys`.
+    """Give voxel ijk a block number under this stamp, once; counters[0] counts blocks, for which
+    there is room in `keys`.
     """
     at = ijk + INDEX_HALF
-    if index.stamp[at] != frame:
-        if ti.atomic_max(index.stamp[at], frame) != frame:
+    if index.stamp[at] != stamp:
+        if ti.atomic_max(index.stamp[at], stamp) != stamp:
             b = ti.atomic_add(counters[0], 1)
-            if b < keys.shape[0]:
-                index.block[at] = b
-                for d in ti.static(range(3)):
-                    keys[b, d] = ijk[d]
+            index.block[at] = b + 1
+            for d in ti.static(range(3)):
+                keys[b, d] = ijk[d]
+
+
+@ti.func
+def block_in(index: ti.template(), ijk: ti.template()) -> ti.i32:
+    """The block number of a voxel that was touched."""
+    return index.block[ijk + INDEX_HALF] - 1
 
 
 @ti.kernel
 def touch_points(
     # in:
-    points: Floats2,  # (N, 3) world [m]
+    found: Ints1,  # (R,) points in each run
+    slots: ti.i32,  # places of a run
+    points: Floats2,  # (R slots, 3) world [m]
+    counts: Ints1,  # (R slots,) pixels behind each; 0: left out
     per_meter: ti.f32,  # 1 / voxel size
-    frame: ti.i32,
-    chunk: ti.i32,  # consecutive points that one thread takes
+    stamp: ti.i32,
     spread: ti.template(),  # touch all 8 doubled voxels that contain a point; else its own voxel
     # in and out:
     index: ti.template(),
@@ -91,19 +98,20 @@ def touch_points(
     # out:
     keys: Ints2,  # (B, 3) voxel of each block
 ):
-    for part in range((points.shape[0] + chunk - 1) // chunk):
+    for part in range(found.shape[0]):
         previous = ti.Vector([INDEX_HALF, 0, 0])
-        for n in range(part * chunk, ti.min((part + 1) * chunk, points.shape[0])):
+        for n in range(part * slots, part * slots + found[part]):
             x = row3(points, n) * per_meter
-            if all_within(x, INDEX_HALF - 1.0):
-                ijk = voxel_of(x - 0.5) if ti.static(spread) else voxel_of(x)
-                if any(ijk != previous):  # neighbours in the image mostly share a voxel
-                    for o in range(8 if ti.static(spread) else 1):
-                        corner = ti.Vector([o // 4, o // 2 % 2, o % 2])
-                        touch(ijk + corner, frame, index, keys, counters)
-                    previous = ijk
-            else:
-                ti.atomic_add(counters[1], 1)
+            if counts[n] > 0:
+                if all_within(x, INDEX_HALF - 1.0):
+                    ijk = voxel_of(x - 0.5) if ti.static(spread) else voxel_of(x)
+                    if any(ijk != previous):  # neighbours in the image mostly share a voxel
+                        for o in range(8 if ti.static(spread) else 1):
+                            corner = ti.Vector([o // 4, o // 2 % 2, o % 2])
+                            touch(ijk + corner, stamp, index, keys, counters)
+                        previous = ijk
+                else:
+                    ti.atomic_add(counters[1], 1)
 
 
 @ti.kernel
@@ -116,7 +124,35 @@ def block_of_points(
     blocks: Ints1,  # (N,)
 ):
     for n in range(points.shape[0]):
-        blocks[n] = index.block[voxel_of(row3(points, n) * per_meter) + INDEX_HALF]
+        blocks[n] = block_in(index, voxel_of(row3(points, n) * per_meter))
+
+
+@ti.kernel
+def forget_blocks(
+    # in:
+    first: ti.i32,
+    blocks: ti.i32,
+    keys: Ints2,  # (B, 3)
+    # in and out:
+    index: ti.template(),  # from block `first` on they were not touched
+):
+    for b in range(first, blocks):
+        at = row3(keys, b) + INDEX_HALF
+        index.stamp[at] = 0
+        index.block[at] = 0
+
+
+@ti.kernel
+def block_of_points(
+    # in:
+    points: Floats2,  # (N, 3) world [m], in touched voxels
+    per_meter: ti.f32,
+    index: ti.template(),
+    # out:
+    blocks: Ints1,  # (N,)
+):
+    for n in range(points.shape[0]):
+        blocks[n] = block_in(index, voxel_of(row3(points, n) * per_meter))
 
 
 @ti.kernel

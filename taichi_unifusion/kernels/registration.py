@@ -9,9 +9,8 @@ that the result does not depend on the order in which threads run.
 
 import taichi as ti
 
-from .arrays import Floats2, Floats3
+from .arrays import Bytes3, Floats2, Floats3
 from .camera import Intrinsics, Pose, lift, project
-from .images import Bytes3
 
 # of a surfel image; 8 numbers fill half a cache line
 DEPTH, NORMAL, INTENSITY, SLOPE_U, SLOPE_V, CHANNELS = 0, 1, 4, 5, 6, 8

@@ -15,7 +15,7 @@ from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, row3
 from .cells import CELLS, cell_bit, cells_before, first_cell
 from .encoding import position_features, position_gradient
 from .gram import flush, keep_sums, solve_voxel
-from .index import INDEX_HALF, in_range
+from .index import INDEX_HALF, block_in, in_range
 
 TILE = 128  # samples whose features are held at once: the products run over this contiguous axis
 
@@ -30,11 +30,11 @@ def neighbor_step(o: ti.i32):
 def find_neighbors(
     # in:
     index: ti.template(),
-    frame: ti.i32,
+    stamp: ti.i32,
     blocks: ti.i32,
     keys: Ints2,  # (B, 3)
     # out:
-    neighbors: Ints2,  # (B, 27) block number of each neighbour, -1 where this frame does not touch it
+    neighbors: Ints2,  # (B, 27) block number of each neighbour, -1 where it was not touched
 ):
     for b in range(blocks):
         for o in range(14, 27):
@@ -46,8 +46,8 @@ def find_neighbors(
             ijk = row3(keys, b) + neighbor_step(o)
             found = -1
             if in_range(ijk):
-                if index.stamp[ijk + INDEX_HALF] == frame:
-                    found = index.block[ijk + INDEX_HALF]
+                if index.stamp[ijk + INDEX_HALF] == stamp:
+                    found = block_in(index, ijk)
                     neighbors[found, 26 - o] = b
             neighbors[b, o] = found
 
@@ -107,12 +107,14 @@ def add_cell(
 def encode_cells(
     # in:
     layout: ti.template(),
-    blocks: ti.i32,
+    begin: ti.i32,  # the first block to encode...
+    end: ti.i32,  # ...and the one after the last
     neighbors: Ints2,  # (B, 27)
     masks: Masks2,  # (B, 2) occupied cells
     window: Masks2,  # (27, 2) cells of each neighbour that count
-    totals: Ints1,  # (B,) points in the block itself
-    starts: Ints1,  # (B,) first row of each block in `cells`
+    # (B, 3) first row of each block in `cells`, points in the block itself, bits of the frames that
+    # saw it
+    rows: Ints2,
     # (M, 1 + c [+ 3]) root of the count, then the mean targets, and normals if `derivatives`, times
     # it
     cells: Floats2,
@@ -120,7 +122,7 @@ def encode_cells(
     # voxel
     features: Floats3,
     minimum: ti.i32,  # blocks with fewer points are not encoded
-    noise: ti.f32,  # d of Eq. 6, in units of the kernel's variance
+    noise: ti.f32,  # d of Eq. 6, of one frame, in units of the kernel's variance
     # out:
     tiles: ti.template(),  # (W, rows, TILE) scratch of W workers
     weights: Floats1,  # (B,) points in the doubled voxel, 0 where not encoded
@@ -133,24 +135,28 @@ def encode_cells(
     for i in range(workers * stride):
         if i % stride == 0:
             worker = i // stride
-            for v in range(worker * blocks // workers, (worker + 1) * blocks // workers):
+            blocks = end - begin
+            first_block = begin + worker * blocks // workers
+            for v in range(first_block, begin + (worker + 1) * blocks // workers):
                 weights[v] = 0.0
-                if totals[v] >= minimum:
+                if rows[v, 1] >= minimum:
                     G = ti.Vector([0.0] * (layout.rows * size))
                     mean = ti.Vector([0.0] * channels)
-                    filled, weight = 0, 0.0
+                    filled, weight, seen = 0, 0.0, ti.u32(0)
                     for o in range(28):  # the last round has no neighbour, see `flush`
                         last = o == 27
                         b, step = v, neighbor_step(o)
                         if not last:
                             b = neighbors[v, o]
                         if b >= 0:
-                            first = starts[b]
+                            first = rows[b, 0]
                             for half in range(2):
                                 occupied = masks[b, half]
                                 wanted = ti.u32(1)
                                 if not last:
                                     wanted = occupied & window[o, half]
+                                    if wanted != 0:
+                                        seen |= ti.cast(rows[b, 2], ti.u32)
                                 while wanted != 0:
                                     if last:
                                         wanted = ti.u32(0)
@@ -178,7 +184,8 @@ def encode_cells(
                     if ti.static(layout.information):
                         keep_sums(layout, v, weight, mean, G, encoded, weights)
                     else:
-                        solve_voxel(layout, v, noise, weight, mean, G, encoded, weights)
+                        frames = ti.cast(ti.math.popcnt(seen), ti.f32)
+                        solve_voxel(layout, v, noise * frames, weight, mean, G, encoded, weights)
 
 
 @ti.kernel

@@ -1,5 +1,5 @@
-"""Evidence for the surface and against it: a frame votes in every cell that it sees or sees
-through.
+"""Evidence for the surface and against it: a frame, one *view* of a window, votes in every cell that
+it sees or sees through.
 
 A regression extrapolates: where a surface ends, its field goes on. What ends it are rays that pass
 through. Every cell of a voxel (its 4^3 quarters) counts the frames that saw surface in it, minus
@@ -9,7 +9,7 @@ those that read depth behind it.
 import taichi as ti
 
 from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, Votes2, row3
-from .camera import Intrinsics, Pose
+from .camera import Intrinsics
 from .cells import BLOCK_CELLS, CELLS, cell_center, cell_in_lattice, has_cell
 from .index import INDEX_HALF, find, voxel_of
 
@@ -19,13 +19,14 @@ SLACK_NOISE = 0.003  # ...plus this much [1/m] times its depth squared: two sigm
 GRAZING = 0.1  # cosine; rays flatter on a surface than this cannot say that they pass through it
 ALONE = 0.45  # the surface of a cell lies within this distance of its centre [voxels]
 LEAST_TENT = 1e-6  # smallest sum of tent weights that counts; below it the default 1 is used
+FREE, SURFACE, NOTHING = range(3)  # what there is to ask in a cell: none was seen there yet, or is
 FLAT = 0.2  # a field with a smaller slope than this has no surface to speak of
 
 
 @ti.func
-def read_behind(p: ti.template(), depth: ti.template(), K: ti.template()):
-    """How far behind p [m, camera] the reading of its pixel lies [m], and whether there is a
-    reading.
+def read_behind(p: ti.template(), k: ti.i32, depth: ti.template(), K: ti.template()):
+    """How far behind p [m, camera] the reading of its pixel in view k lies [m], and whether there
+    is a reading.
     """
     behind, known = 0.0, False
     if p[2] > 0:
@@ -33,8 +34,8 @@ def read_behind(p: ti.template(), depth: ti.template(), K: ti.template()):
         u = p[0] * per_depth * K[0] + K[2] + 0.5
         v = p[1] * per_depth * K[1] + K[3] + 0.5
         # before the cast, which could overflow
-        if u >= 0 and v >= 0 and u < depth.shape[1] and v < depth.shape[0]:
-            reading = depth[ti.cast(v, ti.i32), ti.cast(u, ti.i32)]
+        if u >= 0 and v >= 0 and u < depth.shape[2] and v < depth.shape[1]:
+            reading = depth[k, ti.cast(v, ti.i32), ti.cast(u, ti.i32)]
             behind, known = reading - p[2], reading > 0
     return behind, known
 
@@ -66,18 +67,19 @@ def add_votes(evidence: ti.template(), s: ti.i32, cell: ti.i32, votes: ti.i32):
 def seen_beside(
     p: ti.template(),
     slack: ti.f32,
+    k: ti.i32,
     depth: ti.template(),
     K: ti.template(),
 ):
-    """Whether a pixel beside that of p [m, camera] reads its depth: on glass and dark things,
-    readings come and go.
+    """Whether a pixel beside that of p [m, camera] in view k reads its depth: on glass and dark
+    things, readings come and go.
     """
     seen = False
     u = p[0] / p[2] * K[0] + K[2] + 0.5
     v = p[1] / p[2] * K[1] + K[3] + 0.5
-    if u >= 1 and v >= 1 and u < depth.shape[1] - 1 and v < depth.shape[0] - 1:
+    if u >= 1 and v >= 1 and u < depth.shape[2] - 1 and v < depth.shape[1] - 1:
         for o in range(9):
-            reading = depth[ti.cast(v, ti.i32) + o // 3 - 1, ti.cast(u, ti.i32) + o % 3 - 1]
+            reading = depth[k, ti.cast(v, ti.i32) + o // 3 - 1, ti.cast(u, ti.i32) + o % 3 - 1]
             seen = seen or (reading > 0 and ti.abs(reading - p[2]) < slack)
     return seen
 
@@ -86,22 +88,21 @@ def seen_beside(
 def surface_vote(
     p: ti.template(),
     normal: ti.template(),
-    voxel_size: ti.f32,
+    behind: ti.f32,
+    known: ti.i32,
+    slack: ti.f32,
+    k: ti.i32,
     depth: ti.template(),
     K: ti.template(),
 ):
-    """1 where a reading saw a point p of the surface [m, camera], -1 where it passed through, else
-    0.
+    """1 where a reading of view k, `behind` a point p of the surface [m, camera], saw it, -1 where it
+    passed through, else 0; on a slanted surface, depth changes across a pixel.
     """
-    behind, known = read_behind(p, depth, K)
     cosine = ti.max(ti.abs(normal.dot(p)) / p.norm(), 0.02)
-    # depth across one pixel
-    pixel = p[2] / K[0] * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine
-    slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2] + pixel
+    slack += p[2] / K[0] * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine
     vote = 0
-    if not known:
-        if p[2] > 0:
-            vote = ti.cast(seen_beside(p, slack, depth, K), ti.i32)
+    if known == 0:
+        vote = ti.cast(seen_beside(p, slack, k, depth, K), ti.i32)
     elif behind > slack:
         vote = -1 if cosine > GRAZING else 0
     elif behind > -slack:
@@ -109,66 +110,109 @@ def surface_vote(
     return vote
 
 
+@ti.func
+def rotation_and_corner(
+    T: ti.template(), k: ti.i32, s: ti.i32, keys: ti.template(), voxel_size: ti.f32
+):
+    """Rotation of view k from voxels in the world to metres in the camera, and where the corner of
+    voxel s comes to lie.
+    """
+    R = ti.Matrix([[T[k, i, j] * voxel_size for j in range(3)] for i in range(3)])
+    return R, R @ row3(keys, s) + ti.Vector([T[k, i, 3] for i in ti.static(range(3))])
+
+
+@ti.func
+def views_of(
+    # in:
+    s: ti.i32,
+    keys: ti.template(),
+    voxel_size: ti.f32,
+    depth: ti.template(),
+    K: ti.template(),
+    T: ti.template(),
+) -> ti.u32:
+    """The views in whose images voxel s may lie, as bits."""
+    seen = ti.u32(0)
+    for k in range(T.shape[0]):
+        R, corner = rotation_and_corner(T, k, s, keys, voxel_size)
+        center = corner + R @ ti.Vector([0.5, 0.5, 0.5])
+        z = ti.max(center[2], 1e-3)
+        # what votes lies within a voxel's edge of its centre
+        around = 1.5 * voxel_size * ti.max(K[0], K[1]) / ti.max(center[2] - voxel_size, 1e-3)
+        u = center[0] / z * K[0] + K[2]
+        v = center[1] / z * K[1] + K[3]
+        if center[2] > -voxel_size:
+            if (
+                u > -around
+                and v > -around
+                and u < depth.shape[2] + around
+                and v < depth.shape[1] + around
+            ):
+                seen |= ti.u32(1) << ti.cast(k, ti.u32)
+    return seen
+
+
 @ti.kernel
 def vote_cells(
     # in:
     rank: ti.template(),
-    voxels: ti.i32,
+    begin: ti.i32,  # the first slot to vote in...
+    end: ti.i32,  # ...and the one after the last
     keys: Ints2,  # (S, 3)
     masks: Masks2,  # (S, 2) cells with support
     latents: Floats3,  # (S, l, 1)
     features: Floats3,  # (64, 4, l) f_posi and its gradient by voxel units at the cells' centres
     voxel_size: ti.f32,
-    depth: Floats2,  # (H, W) [m], 0: no reading
+    depth: Floats3,  # (K or more, H, W) [m] of K views, 0: no reading
     K: Intrinsics,
-    T_camera_world: Pose,  # [m]
-    sign: ti.i32,  # 1; -1 takes the frame's votes back
+    T_camera_world: Floats3,  # (K, 3, 4) [m]
+    sign: ti.i32,  # 1; -1 takes the votes back
     # in and out:
-    # (S, 64) += 1 where the frame saw the cell's surface, -= 1 where it saw through the cell
+    # (S, 64) += views that saw the cell's surface, -= those that saw through the cell
     evidence: Votes2,
 ):
-    for s in range(voxels):
-        # world [voxels] -> camera [m]
-        R = ti.Matrix([[T_camera_world[i, j] * voxel_size for j in range(3)] for i in range(3)])
-        corner = R @ row3(keys, s) + ti.Vector([T_camera_world[i, 3] for i in ti.static(range(3))])
-        center = corner + R @ ti.Vector([0.5, 0.5, 0.5])
-        z = ti.max(center[2], 1e-3)
-        # what votes lies within a voxel's edge of its centre
-        focal = ti.max(K[0], K[1])
-        around = 1.5 * voxel_size * focal / ti.max(center[2] - voxel_size, 1e-3)
-        u = center[0] / z * K[0] + K[2]
-        v = center[1] / z * K[1] + K[3]
-        in_image = (
-            u > -around
-            and v > -around
-            and u < depth.shape[1] + around
-            and v < depth.shape[0] + around
-        )
-        if center[2] > -voxel_size and in_image:
+    for s in range(begin, end):
+        seen = views_of(s, keys, voxel_size, depth, K, T_camera_world)
+        if seen != 0:
             F = ti.Vector([0.0] * rank)
             for a in range(rank):
                 F[a] = latents[s, a, 0]
-            for cell in range(BLOCK_CELLS):
-                vote = 0
-                # no surface here yet; record that this frame saw through, in case a later frame
-                # extrapolates one
-                if has_cell(masks, s, cell) == 0:
-                    p = corner + R @ cell_center(cell)
-                    behind, known = read_behind(p, depth, K)
-                    if known and behind > SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]:
-                        vote = -1
-                else:
+            kinds = ti.Vector([0] * BLOCK_CELLS)
+            votes = ti.Vector([0] * BLOCK_CELLS)
+            points = ti.Vector([0.0] * (3 * BLOCK_CELLS))
+            normals = ti.Vector([0.0] * (3 * BLOCK_CELLS))
+            for cell in range(BLOCK_CELLS):  # once for all views
+                x, normal = cell_center(cell), ti.Vector([0.0, 0.0, 0.0])
+                if has_cell(masks, s, cell) != 0:
                     x, normal, found = cell_surface(rank, F, cell, features)
-                    if found:
-                        vote = surface_vote(
-                            corner + R @ x,
-                            R @ normal / voxel_size,
-                            voxel_size,
-                            depth,
-                            K,
-                        )
-                if vote != 0:
-                    add_votes(evidence, s, cell, sign * vote)
+                    kinds[cell] = SURFACE if found else NOTHING
+                for d in ti.static(range(3)):
+                    points[3 * cell + d], normals[3 * cell + d] = x[d], normal[d]
+            for k in range(T_camera_world.shape[0]):
+                if (seen >> ti.cast(k, ti.u32)) & 1 != 0:
+                    R, corner = rotation_and_corner(T_camera_world, k, s, keys, voxel_size)
+                    for cell in range(BLOCK_CELLS):
+                        if kinds[cell] != NOTHING:
+                            at = 3 * cell
+                            x = ti.Vector([points[at], points[at + 1], points[at + 2]])
+                            p = corner + R @ x
+                            behind, known = read_behind(p, k, depth, K)
+                            slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]
+                            if known and ti.abs(behind) <= slack:  # as mostly
+                                votes[cell] += kinds[cell]  # whatever the angle
+                            elif kinds[cell] == FREE:
+                                # record that this view saw through, in case a later frame
+                                # extrapolates a surface here
+                                votes[cell] -= ti.cast(known and behind > slack, ti.i32)
+                            elif p[2] > 0:
+                                n = ti.Vector([normals[at], normals[at + 1], normals[at + 2]])
+                                normal = R @ n / voxel_size
+                                votes[cell] += surface_vote(
+                                    p, normal, behind, known, slack, k, depth, K
+                                )
+            for cell in range(BLOCK_CELLS):
+                if votes[cell] != 0:
+                    add_votes(evidence, s, cell, sign * votes[cell])
 
 
 @ti.kernel

@@ -6,11 +6,11 @@ import dataclasses
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 from ..errors import InputError, MapCorrupt
 from ..files.maps import read_map, write_map
-from ..types import PointCloud
+from ..types import Frame, PointCloud
 from .encoding import EncoderSettings
 from .settings import MapSettings
 from .voxel_grid import VoxelData, VoxelGrid
@@ -27,8 +27,18 @@ class Integration:
     total_voxels: int  # voxels in the map afterwards
 
 
+class Unfused(Protocol):
+    """Frames that were summed up for a map and wait to be fused."""
+
+    def flush(self) -> None: ...
+
+
 class BaseMap(ABC, Generic[S]):
-    """Name, settings, voxels, files and merging; a subclass says how clouds become voxels."""
+    """Name, settings, voxels, files and merging; a subclass says how clouds become voxels.
+
+    Where a pipeline sums up frames before it fuses them, `waiting` is what it has not fused yet;
+    whatever reads or changes the map as a whole calls `flush` first.
+    """
 
     kind: ClassVar[str]  # name of the class of map in files
     settings_type: ClassVar[type[MapSettings]]
@@ -36,6 +46,12 @@ class BaseMap(ABC, Generic[S]):
     def __init__(self, name: str, channels: int, settings: S, grid: VoxelGrid) -> None:
         self.name, self.channels, self.settings = name, channels, settings
         self.grid = grid
+        self.waiting: Unfused | None = None
+
+    def flush(self) -> None:
+        """Fuse the frames that a pipeline has summed up for this map, if there are any."""
+        if self.waiting is not None:
+            self.waiting.flush()
 
     @property
     def voxel_size(self) -> float:
@@ -44,20 +60,23 @@ class BaseMap(ABC, Generic[S]):
 
     def __len__(self) -> int:
         """Number of voxels."""
+        self.flush()
         return len(self.grid)
 
     @property
     def memory_bytes(self) -> int:
         """Bytes of the voxels and their index."""
+        self.flush()
         return self.grid.memory_bytes
 
     def voxels(self) -> VoxelData:
         """All voxels by value, sorted by index."""
+        self.flush()
         return self.grid.export()
 
     @abstractmethod
-    def wants(self, cloud: PointCloud) -> bool:
-        """Whether a cloud has what this map takes."""
+    def wants(self, cloud: PointCloud | Frame) -> bool:
+        """Whether a cloud, or a frame, has what this map takes."""
 
     @abstractmethod
     def integrate(self, cloud: PointCloud) -> Integration:
@@ -79,7 +98,8 @@ class BaseMap(ABC, Generic[S]):
             raise InputError(
                 "merge: the maps differ: {} '{}' x{} {} and {} '{}' x{} {}".format(*mine, *theirs)
             )
-        self._fuse_voxels(other.grid.export())
+        self.flush()
+        self._fuse_voxels(other.voxels())
 
     def _identity(self) -> tuple[str, str, int, S]:
         return self.kind, self.name, self.channels, self.settings
@@ -99,7 +119,7 @@ class BaseMap(ABC, Generic[S]):
             "voxels": len(self),
             "settings": dataclasses.asdict(self.settings),
         }
-        write_map(Path(path), self.grid.export().tensors, manifest)
+        write_map(Path(path), self.voxels().tensors, manifest)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -1,9 +1,9 @@
-"""Binner: a cloud's points -> averages in the cells of the voxels that they touch (Sec. IV-A, IV-B)."""
+"""Binner: points -> averages in the cells of the voxels that they touch (Sec. IV-A, IV-B)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,43 +12,31 @@ from numpy.typing import NDArray
 
 from ..errors import OutOfRange
 from ..kernels import binning as kernels
-from ..kernels.cells import BLOCK_CELLS
-from ..kernels.index import INDEX_HALF, block_of_points, touch_points
+from ..kernels.binning import KEY_COLUMNS
+from ..kernels.index import INDEX_HALF, block_of_points, forget_blocks, touch_points
+from ..kernels.patches import Patches, Sink, Target, Values
+from ..kernels.pools import copy_rows
 from ..kernels.regression import find_neighbors
-from ..runtime import DeviceArray
-from .local_lim import Binned, SortedSamples
+from ..runtime import Arena, DeviceArray
+from ..types import PointCloud
+from .local_lim import FIRST_BLOCKS, Binned, CellArrays, OpenCells, SortedSamples
 from .voxel_grid import VoxelGrid
 
-TOGETHER = 4  # arrays of values that the kernel takes
+TOGETHER = 3  # arrays of values that the kernel takes
 # consecutive points a thread takes: long enough for runs in one cell, short enough to balance
 CPU_CHUNK = 32
-FIRST_BLOCKS = 2048  # room to begin with
-
-
-@dataclass(frozen=True)
-class _Blocks:
-    """The voxels that a frame touches, numbered."""
-
-    turn: int
-    frame: int  # stamp of the frame in the index
-    count: int
-    keys: DeviceArray  # (B, 3)
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """Points, and sums over them, in the cells of blocks."""
-
-    counts: DeviceArray  # (B, 64)
-    sums: DeviceArray  # (B, 64, c)
+NEIGHBORHOOD = 27  # voxels that a block's surfels may reach: itself and those around it
 
 
 class Binner:
-    """Sums a cloud's values, `channels` in all, in the cells (quarters) of the voxels of a grid.
+    """Sums what clouds carry, `channels` values in all, in the cells (quarters) of the voxels of a
+    grid.
 
     A cell supports surface where it holds `support_points` points. With `with_positions` also the
     points themselves, from the cell's centre, are averaged.
     """
+
+    frames = kernels.POINT_FRAMES  # column of the keys with the bits of the frames that count
 
     def __init__(
         self,
@@ -61,35 +49,106 @@ class Binner:
     ) -> None:
         self.grid, self.voxel_size, self.channels = grid, voxel_size, channels
         self.support_points, self.with_positions = support_points, with_positions
-        self.chunk = CPU_CHUNK if grid.runtime.device == "cpu" else 1
 
-    def bin(self, points: NDArray[np.float32], values: Sequence[NDArray[np.float32]]) -> Binned:
-        """Average arrays of values (N, c), side by side, at points (N, 3) world [m].
+    @property
+    def width(self) -> int:
+        """How many values are summed in a cell."""
+        return self.channels + 3 * self.with_positions
+
+    def open(self, arrays: CellArrays) -> OpenCells:
+        """No points yet, in arrays of this binner's width that hold none."""
+        assert arrays.width == self.width
+        if self.grid.unclosed is not None:  # an exception came between; its keys are there still
+            keys = self.grid.unclosed.keys
+            forget_blocks(0, keys.shape[0], keys, self.grid.index)
+        self.grid.unclosed = arrays
+        return OpenCells(arrays, self.grid.next_frame(), 0)
+
+    def touch(self, cells: OpenCells, patches: Patches) -> OpenCells:
+        """Make room for the voxels that patches lie in; nothing is summed yet.
+
+        Raises OutOfRange for points beyond the index range, with the cells as they were.
+        """
+        return self._touch(cells, patches, spread=False)
+
+    def forget(self, cells: OpenCells, before: OpenCells) -> None:
+        """Undo what `touch` did since `before`."""
+        forget_blocks(before.count, cells.count, cells.arrays.keys, self.grid.index)
+
+    def target(self, cells: OpenCells) -> Target:
+        """The cells as `make_patches` takes them."""
+        arrays = cells.arrays
+        sink = Sink(self.grid.index, 1.0 / self.voxel_size)
+        return Target(sink, cells.stamp, cells.count, arrays.keys, arrays.sums)
+
+    def reaches(self, T_world_camera: NDArray[np.float64], reach: float) -> bool:
+        """Whether all points within `reach` [m] of a camera lie in the index range."""
+        farthest = float(np.abs(T_world_camera[:3, 3]).max()) + reach
+        return farthest < (INDEX_HALF - 1) * self.voxel_size
+
+    def add(
+        self, cells: OpenCells, patches: Patches, values: Sequence[Values], frame: int = 0
+    ) -> None:
+        """Sum up patches, whose voxels were touched, and what they carry; `frame` is the number of
+        theirs in its window.
+        """
+        arrays = [each.values for each in values]
+        counts = values[0].counts if values else patches.counts
+        if len(arrays) > TOGETHER:
+            arrays = [*arrays[: TOGETHER - 1], _side_by_side(arrays[TOGETHER - 1 :])]
+        nothing = TOGETHER - len(arrays)
+        channels = tuple(array.shape[1] for array in arrays) + (0,) * nothing
+        values_0, values_1, values_2 = [*arrays, *[patches.points] * nothing]
+        kernels.bin_points(
+            patches.found,
+            patches.slots,
+            patches.points,
+            counts,
+            values_0,
+            values_1,
+            values_2,
+            channels,
+            1.0 / self.voxel_size,
+            1 << frame,
+            self.with_positions,
+            self.grid.index,
+            cells.arrays.keys,
+            cells.arrays.sums,
+        )
+
+    def close(self, cells: OpenCells, arena: Arena) -> Binned:
+        """Average what was summed; the arrays of the cells hold nothing then. What comes out is on
+        loan from `arena`.
+        """
+        return self._compact(cells, arena)
+
+    def bin(self, patches: Patches, values: Sequence[Values]) -> Binned:
+        """Average what patches carry, side by side.
 
         Raises OutOfRange for points beyond the index range.
         """
-        blocks = self._touch(points)
-        sums = self._sums("points", self.channels + 3 * self.with_positions, blocks.count)
-        self._add(points, values, self.with_positions, sums)
-        return self._compact(blocks, sums)
+        cells = self.touch(self.open(self._shared("cells", self.width)), patches)
+        self.add(cells, patches, values)
+        return self.close(cells, self.grid.runtime.arena)
 
     def sort(self, samples: NDArray[np.float32], targets: NDArray[np.float32]) -> SortedSamples:
         """Sort samples (N, 3) world [m] with targets (N, c) by voxel; each is kept as it is.
 
         Raises OutOfRange for samples beyond the index range.
         """
-        blocks = self._touch(samples, spread=True)
+        counting = Binner(self.grid, self.voxel_size, 0, support_points=self.support_points)
+        patches = patches_of(PointCloud(samples), self.grid.runtime.device)
+        cells = counting._touch(counting.open(self._shared("cells", 0)), patches, spread=True)
         block_of = np.empty(len(samples), np.int32)
         block_of_points(samples, 1.0 / self.voxel_size, self.grid.index, block_of)
         order = np.argsort(block_of, kind="stable")
-        starts = np.searchsorted(block_of[order], np.arange(blocks.count + 1)).astype(np.int32)
-        sums = self._sums("points", 0, blocks.count)
-        self._add(samples, [], False, sums)
-        binned = self._compact(blocks, sums)
+        starts = np.searchsorted(block_of[order], np.arange(cells.count + 1)).astype(np.int32)
+        counting.add(cells, patches, [])
+        binned = counting.close(cells, self.grid.runtime.arena)
         return SortedSamples(
-            blocks.turn,
-            blocks.count,
-            blocks.keys,
+            binned.loan,
+            binned.count,
+            binned.keys,
             binned.neighbors,
             binned.support,
             starts,
@@ -97,88 +156,65 @@ class Binner:
             np.ascontiguousarray(targets[order], dtype=np.float32),
         )
 
-    def _touch(
-        self, points: NDArray[np.float32], spread: bool = False, room: int = FIRST_BLOCKS
-    ) -> _Blocks:
+    def _touch(self, cells: OpenCells, patches: Patches, *, spread: bool) -> OpenCells:
         """Number every voxel that holds a point, or whose doubled voxel does (`spread`)."""
-        while True:
-            turn, frame = self.grid.runtime.arena.next_turn(), self.grid.next_frame()
-            keys = self._borrow("keys", ti.i32, room, 3)
-            counters = np.zeros(2, np.int32)
-            touch_points(
-                points,
-                1.0 / self.voxel_size,
-                frame,
-                self.chunk,
-                spread,
-                self.grid.index,
-                counters,
-                keys,
-            )
-            ti.sync()
-            count, outside = int(counters[0]), int(counters[1])
-            if outside:
-                raise OutOfRange(
-                    f"{outside} of {len(points)} points lie more than "
-                    f"{INDEX_HALF * self.voxel_size:.0f} m from the origin or are not finite: move "
-                    "the origin nearer to the scene, or use larger voxels"
-                )
-            if count <= keys.shape[0]:
-                return _Blocks(turn, frame, count, keys)
-            room = count
-
-    def _add(
-        self,
-        points: NDArray[np.float32],
-        values: Sequence[NDArray[np.float32]],
-        with_positions: bool,
-        sums: _Sums,
-    ) -> None:
-        if len(values) > TOGETHER:
-            values = [*values[: TOGETHER - 1], np.hstack(values[TOGETHER - 1 :])]
-        nothing = TOGETHER - len(values)
-        channels = tuple(array.shape[1] for array in values) + (0,) * nothing
-        values_0, values_1, values_2, values_3 = [*values, *[points] * nothing]
-        kernels.bin_points(
-            points,
-            values_0,
-            values_1,
-            values_2,
-            values_3,
-            channels,
+        arrays = cells.arrays
+        # as many at most
+        arrays.reserve_keys(cells.count + (8 if spread else 1) * patches.total, cells.count)
+        counters = np.array([cells.count, 0], np.int32)
+        touch_points(
+            patches.found,
+            patches.slots,
+            patches.points,
+            patches.counts,
             1.0 / self.voxel_size,
-            self.chunk,
-            with_positions,
+            cells.stamp,
+            spread,
             self.grid.index,
-            sums.counts,
-            sums.sums,
+            counters,
+            arrays.keys,
         )
-
-    def _compact(self, blocks: _Blocks, sums: _Sums) -> Binned:
-        """A row for every cell with points; the sums become 0."""
-        n, width = blocks.count, sums.sums.shape[2]
-        masks, support = self._borrow("masks", ti.u32, n, 2), self._borrow("support", ti.u32, n, 2)
-        totals, neighbors = (
-            self._borrow("totals", ti.i32, n),
-            self._borrow("neighbors", ti.i32, n, 27),
-        )
-        occupied = np.empty(n, np.int32)
-        kernels.mark_cells(n, sums.counts, self.support_points, masks, support, totals, occupied)
         ti.sync()
-        starts = (np.cumsum(occupied) - occupied).astype(np.int32)
-        cells = self._borrow("cells", ti.f32, int(occupied.sum()), 1 + width)
-        kernels.compact_cells(n, starts, masks, width, sums.counts, sums.sums, cells)
-        find_neighbors(self.grid.index, blocks.frame, n, blocks.keys, neighbors)
-        return Binned(blocks.turn, n, blocks.keys, neighbors, masks, support, totals, starts, cells)
+        after, outside = replace(cells, count=int(counters[0])), int(counters[1])
+        if outside:
+            self.forget(after, cells)
+            raise OutOfRange(
+                f"{outside} of {patches.total} points lie more than "
+                f"{INDEX_HALF * self.voxel_size:.0f} m from the origin or are not finite: move "
+                "the origin nearer to the scene, or use larger voxels"
+            )
+        arrays.reserve(after.count, cells.count)
+        return after
 
-    def _sums(self, use: str, width: int, blocks: int) -> _Sums:
-        return _Sums(
-            self._borrow(f"{use}: counts", ti.i32, blocks, BLOCK_CELLS),
-            self._borrow(f"{use}: sums", ti.i64, blocks, BLOCK_CELLS, max(width, 1)),
+    def _compact(self, cells: OpenCells, arena: Arena) -> Binned:
+        """A row for every cell with points; the sums become 0."""
+        n, arrays, loan = cells.count, cells.arrays, arena.next_turn()
+
+        def borrow(name: str, dtype: Any, *row: int) -> DeviceArray:
+            return arena.borrow(name, dtype, (max(n, FIRST_BLOCKS), *row))
+
+        keys = borrow("keys", ti.i32, KEY_COLUMNS)  # a copy: the next window begins before this one is fused
+        copy_rows(n, arrays.keys, keys)
+        masks, support = borrow("masks", ti.u32, 2), borrow("support", ti.u32, 2)
+        neighbors, rows = borrow("neighbors", ti.i32, 27), np.empty((n, 3), np.int32)
+        kernels.mark_cells(
+            n, arrays.sums, self.support_points, self.frames, arrays.keys, masks, support, rows
         )
+        ti.sync()
+        total = int(rows[:, 0].sum())
+        rows[:, 0] = np.cumsum(rows[:, 0]) - rows[:, 0]
+        room = max(total, FIRST_BLOCKS)
+        averages = arena.borrow("averages", ti.f32, (room, 1 + arrays.width))
+        kernels.compact_cells(n, rows, masks, arrays.width, arrays.sums, averages)
+        find_neighbors(self.grid.index, cells.stamp, n, keys, neighbors)
+        forget_blocks(0, n, keys, self.grid.index)
+        self.grid.unclosed = None
+        return Binned(loan, n, keys, neighbors, masks, support, rows, averages)
 
-    def _borrow(self, name: str, dtype: Any, rows: int, *row: int) -> DeviceArray:
-        return self.grid.runtime.arena.borrow(name, dtype, (max(rows, FIRST_BLOCKS), *row))
+    def _shared(self, use: str, width: int) -> CellArrays:
+        """Arrays that all maps use in turn, for a cloud that is averaged at once."""
+        arena = self.grid.runtime.arena
+        return arena.exact(use, lambda: CellArrays(width), (width,))
 
 
 class SurfelBinner(Binner):
@@ -189,6 +225,8 @@ class SurfelBinner(Binner):
     plane: exact to first order, and its features come from a table.
     """
 
+    frames = kernels.SAMPLE_FRAMES
+
     def __init__(
         self,
         grid: VoxelGrid,
@@ -198,51 +236,56 @@ class SurfelBinner(Binner):
         support_points: int,
         with_normals: bool,
     ) -> None:
-        super().__init__(grid, voxel_size, 1 + 3 * with_normals, support_points=support_points)
+        super().__init__(
+            grid, voxel_size, 3, support_points=support_points, with_positions=True
+        )
         self.steps, self.with_normals = steps, with_normals
 
-    def bin(self, points: NDArray[np.float32], values: Sequence[NDArray[np.float32]]) -> Binned:
-        """Samples of the surfels of points (N, 3) world [m] with unit normals (N, 3): distances
-        [voxels], and normals if asked for. Raises OutOfRange for points beyond the index range.
-        """
-        room = FIRST_BLOCKS
-        while True:
-            blocks = self._touch(points, room=room)
-            surfels = self._sums("surfels", 6, blocks.count)
-            self._add(points, values, True, surfels)
-            room = self._touch_samples(blocks, surfels)
-            if room <= blocks.keys.shape[0]:
-                break
-            surfels.counts.fill(0)
-            surfels.sums.fill(0)
-        samples = self._sums("points", self.channels, room)
-        kernels.bin_surfel_samples(
-            blocks.count,
-            blocks.keys,
-            self.steps,
-            self.with_normals,
-            self.grid.index,
-            surfels.counts,
-            surfels.sums,
-            samples.counts,
-            samples.sums,
-        )
-        return self._compact(replace(blocks, count=room), samples)
-
-    def _touch_samples(self, blocks: _Blocks, surfels: _Sums) -> int:
-        """Number the voxels of the samples beside the surfels too; returns how many blocks there
-        are, which may be more than there was room for.
-        """
-        counters = np.array([blocks.count, 0], np.int32)
+    def close(self, cells: OpenCells, arena: Arena) -> Binned:
+        """Average samples of the surfels: distances [voxels], and normals if asked for."""
+        surfels, count = cells.arrays, cells.count
+        surfels.reserve_keys(NEIGHBORHOOD * count, count)
+        counters = np.array([count, 0], np.int32)
         kernels.touch_surfel_samples(
-            blocks.count,
-            surfels.counts,
+            count,
             surfels.sums,
             self.steps,
-            blocks.frame,
+            cells.stamp,
             self.grid.index,
-            blocks.keys,
+            surfels.keys,
             counters,
         )
         ti.sync()
-        return int(counters[0])
+        samples = self._shared("samples", 1 + 3 * self.with_normals)
+        samples.keys, room = surfels.keys, int(counters[0])
+        samples.reserve(room, 0)
+        kernels.bin_surfel_samples(
+            count,
+            self.steps,
+            self.with_normals,
+            self.grid.index,
+            surfels.keys,
+            surfels.sums,
+            samples.sums,
+        )
+        return self._compact(replace(cells, arrays=samples, count=room), arena)
+
+
+def patches_of(cloud: PointCloud, device: str) -> Patches:
+    """A cloud in world coordinates as patches of a pixel each, or of what it says."""
+    n, slots = len(cloud), CPU_CHUNK if device == "cpu" else 1
+    found = np.full(-(-n // slots), slots, np.int32)
+    if n % slots:
+        found[-1] = n % slots
+    counts = np.ones(n, np.int32) if cloud.counts is None else cloud.counts
+    attributes = {name: Values(values, counts) for name, values in cloud.attributes.items()}
+    pixels = int(counts.sum())
+    return Patches(
+        slots, found, cloud.points, counts, cloud.normals, attributes, n, pixels, (0, 0)
+    )
+
+
+def _side_by_side(arrays: Sequence[DeviceArray]) -> NDArray[np.float32]:
+    """Arrays of values (N, c) as one."""
+    rows = [each if isinstance(each, np.ndarray) else each.to_numpy() for each in arrays]
+    return np.hstack([each[: min(map(len, rows))] for each in rows])

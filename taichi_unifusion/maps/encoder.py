@@ -33,7 +33,7 @@ class Encoder:
     """
 
     def __init__(self, runtime: Runtime, settings: MapSettings, layout: Layout) -> None:
-        self.layout, self.arena = layout, runtime.arena
+        self.layout = layout
         self.min_points, self.noise = settings.min_points, settings.noise
         self.tables = PositionTables(settings, runtime.arena)
         self.window = window_masks(settings.margin)
@@ -55,31 +55,35 @@ class Encoder:
     @compiled_sooner()
     def encode(self, binned: Binned) -> LocalLim:
         """Encode the averages in cells."""
-        self.arena.check_loan(binned.turn)
-        encoded, weights = self._room(binned.count)
+        local = self.room(binned)
+        self.encode_blocks(binned, 0, binned.count, local)
+        return local
+
+    def encode_blocks(self, binned: Binned, begin: int, end: int, local: LocalLim) -> None:
+        """Encode the averages in cells of blocks `begin` to `end` into a local LIM."""
+        binned.loan.check()
         regression.encode_cells(
             self.layout,
-            binned.count,
+            begin,
+            end,
             binned.neighbors,
             binned.masks,
             self.window,
-            binned.totals,
-            binned.starts,
+            binned.rows,
             binned.cells,
             self.cell_features,
             self.min_points,
             self.noise,
             self.tiles,
-            weights,
-            encoded,
+            local.weights,
+            local.encoded,
         )
-        return self._local(binned, encoded, weights)
 
     @compiled_sooner()
     def encode_samples(self, samples: SortedSamples) -> LocalLim:
         """Encode every sample as it is, as published."""
-        self.arena.check_loan(samples.turn)
-        encoded, weights = self._room(samples.count)
+        samples.loan.check()
+        local = self.room(samples)
         regression.encode_points(
             self.layout,
             samples.keys,
@@ -93,31 +97,23 @@ class Encoder:
             self.min_points,
             self.noise,
             self.tiles,
-            weights,
-            encoded,
+            local.weights,
+            local.encoded,
         )
-        return self._local(samples, encoded, weights)
+        return local
 
-    def _room(self, blocks: int) -> tuple[DeviceArray, DeviceArray]:
+    def room(self, source: Binned | SortedSamples) -> LocalLim:
         """Arrays for what is encoded, (B, r, c) or (B, q, 1), and the weights (B,)."""
-        layout = self.layout
+        layout, arena = self.layout, source.loan.arena
         row = (layout.sums, 1) if layout.information else (layout.latent_rows, layout.channels)
-        return (
-            self.arena.borrow("encoded", ti.f32, (blocks, *row)),
-            self.arena.borrow("weights", ti.f32, (blocks,)),
-        )
-
-    def _local(
-        self, source: Binned | SortedSamples, encoded: DeviceArray, weights: DeviceArray
-    ) -> LocalLim:
         return LocalLim(
-            source.turn,
+            source.loan,
             source.count,
             source.keys,
-            encoded,
-            weights,
+            arena.borrow("encoded", ti.f32, (source.count, *row)),
+            arena.borrow("weights", ti.f32, (source.count,)),
             source.support,
-            self.layout.channels,
+            layout.channels,
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Self, overload
 
@@ -15,10 +16,11 @@ from ..errors import FrameError, InputError
 from ..kernels import feature_query as decoding
 from ..kernels import features as kernels
 from ..kernels.cells import CELLS
+from ..kernels.patches import Patches
 from ..runtime import DeviceArray
-from ..types import ImageView, PointCloud
+from ..types import Frame, ImageView, PointCloud
 from .base_map import BaseMap, Integration, check_channels
-from .binner import Binner
+from .binner import Binner, patches_of
 from .encoder import check_points, to_device, window_masks, workers
 from .encoding import position_encoding
 from .local_lim import Binned
@@ -123,7 +125,7 @@ class FeatureMap(BaseMap[FeatureSettings]):
         arrays = dict(zip(kernels.FeaturePools.members, (self.grid[n] for n in names), strict=True))
         return kernels.FeaturePools(**arrays)
 
-    def wants(self, cloud: PointCloud) -> bool:
+    def wants(self, cloud: PointCloud | Frame) -> bool:
         return self.name in cloud.features
 
     def integrate(self, cloud: PointCloud) -> Integration:
@@ -132,15 +134,23 @@ class FeatureMap(BaseMap[FeatureSettings]):
         Raises as `BaseMap.integrate`, and FrameError where no feature is finite; the map is then
         unchanged.
         """
-        runtime.check_alive(self.grid.runtime)
-        features = self._features_of(cloud)
+        features = self._features_of(cloud.features)
         if len(cloud) == 0:
             return Integration(0, 0, len(self))
+        return self._integrate(patches_of(cloud, self.grid.runtime.device), features)
+
+    def integrate_patches(self, patches: Patches) -> Integration:
+        """Fuse the features that a frame's patches see into the map, as `integrate` does."""
+        return self._integrate(patches, self._features_of(patches.features))
+
+    def _integrate(self, patches: Patches, features: ImageView) -> Integration:
+        runtime.check_alive(self.grid.runtime)
         image, usable = self._usable(features.values)
-        binned = self.binner.bin(cloud.points, [])
-        found = self._find_pixels(binned, features, usable)
+        binned = self.binner.bin(patches, [])
+        starts = np.ascontiguousarray(binned.rows[:, 0])
+        found = self._find_pixels(binned, starts, features, usable)
         if not found.seen.any():
-            return Integration(len(cloud), 0, len(self))
+            return Integration(patches.total, 0, len(self))
         slots = np.empty(binned.count, np.int32)
         encoded = self.grid.claim(binned.count, binned.keys, found.weights, slots)
         kernels.fuse_features(
@@ -150,7 +160,7 @@ class FeatureMap(BaseMap[FeatureSettings]):
             binned.neighbors,
             binned.masks,
             self._window,
-            binned.starts,
+            starts,
             binned.cells,
             found.pixels,
             self._cell_features,
@@ -159,14 +169,14 @@ class FeatureMap(BaseMap[FeatureSettings]):
             self._scratch,
             self._pools,
         )
-        return Integration(len(cloud), encoded, len(self))
+        return Integration(patches.total, encoded, len(self))
 
-    def _features_of(self, cloud: PointCloud) -> ImageView:
-        features = cloud.features.get(self.name)
+    def _features_of(self, images: Mapping[str, ImageView]) -> ImageView:
+        features = images.get(self.name)
         if features is None:
             raise InputError(
                 f"feature map '{self.name}': the cloud has no feature image '{self.name}', only "
-                f"{', '.join(sorted(cloud.features)) or 'none'}"
+                f"{', '.join(sorted(images)) or 'none'}"
             )
         if features.values.shape[2] != self.channels:
             raise InputError(
@@ -195,7 +205,11 @@ class FeatureMap(BaseMap[FeatureSettings]):
         return np.ascontiguousarray(rows), usable.astype(np.uint8)
 
     def _find_pixels(
-        self, binned: Binned, features: ImageView, usable: NDArray[np.uint8]
+        self,
+        binned: Binned,
+        starts: NDArray[np.int32],
+        features: ImageView,
+        usable: NDArray[np.uint8],
     ) -> _SeenPixels:
         found = _SeenPixels(
             np.empty(binned.cells.shape[0], np.int32),
@@ -206,7 +220,7 @@ class FeatureMap(BaseMap[FeatureSettings]):
         kernels.find_pixels(
             binned.count,
             binned.keys,
-            binned.starts,
+            starts,
             binned.masks,
             binned.cells,
             self.voxel_size,

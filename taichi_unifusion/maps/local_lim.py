@@ -1,31 +1,91 @@
-"""What passes between the steps of a map: binned points, sorted samples, and a frame's local LIM.
+"""What passes between the steps of a map: sums in cells, binned points, sorted samples, and a local
+LIM.
 
-Their arrays are on loan from the runtime's arena until the next cloud is binned: whoever wants to
-keep a local LIM takes a copy.
+Where a value holds a loan, its arrays are on loan from an arena: whoever wants to keep a local LIM
+takes a copy.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import taichi as ti
 from numpy.typing import NDArray
 
-from ..runtime import DeviceArray
+from ..kernels.binning import KEY_COLUMNS
+from ..kernels.cells import BLOCK_CELLS
+from ..kernels.pools import copy_rows
+from ..runtime import DeviceArray, Loan, grown
+
+FIRST_BLOCKS = 2048  # room to begin with
+FIRST_BYTES = 32 << 20  # of sums: what ten frames of a room take, so that hardly any video waits
+
+
+class CellArrays:
+    """Room for the cells of touched voxels, which grows: sums of `width` values beside the counts.
+
+    All sums and bits are 0 where nothing is summed up.
+    """
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+        blocks = max(FIRST_BYTES // self.block_bytes, FIRST_BLOCKS)
+        # voxel of each block, and bits of the frames that saw it
+        self.keys = ti.ndarray(ti.i32, (blocks, KEY_COLUMNS))
+        # counts, then fixed-point sums of values, by cell
+        self.sums = ti.ndarray(ti.i64, (blocks, BLOCK_CELLS, 1 + width))
+
+    @property
+    def block_bytes(self) -> int:
+        """Bytes of one block's sums."""
+        return 8 * BLOCK_CELLS * (1 + self.width)
+
+    @property
+    def room(self) -> int:
+        """Blocks that there is room for."""
+        return self.sums.shape[0]
+
+    def reserve_keys(self, rows: int, used: int) -> None:
+        """Make room for the keys of `rows` blocks; the first `used` are kept."""
+        self.keys = _grow(self.keys, rows, used)
+
+    def reserve(self, rows: int, used: int) -> None:
+        """Make room for the sums of `rows` blocks; the first `used` are kept."""
+        self.sums = _grow(self.sums, rows, used)
+
+
+def _grow(array: DeviceArray, rows: int, used: int) -> DeviceArray:
+    if rows <= array.shape[0]:
+        return array
+    larger = ti.ndarray(array.dtype, (grown(array.shape[0], rows), *array.shape[1:]))
+    if used:
+        copy_rows(used, array, larger)
+    return larger
+
+
+@dataclass(frozen=True)
+class OpenCells:
+    """Points of one or more frames, summed in the cells of the blocks (voxels) that they touch."""
+
+    arrays: CellArrays
+    stamp: int  # of these blocks in the index of the grid
+    count: int  # blocks
 
 
 @dataclass(frozen=True)
 class Binned:
-    """A cloud's points, averaged in the cells of the blocks (voxels) that they touch."""
+    """Points, averaged in the cells of the blocks (voxels) that they touch."""
 
-    turn: int  # of the arena's loan
+    loan: Loan
     count: int  # B blocks
-    keys: DeviceArray  # (B, 3) voxel of each block
+    keys: DeviceArray  # (B, 3 or more) voxel of each block
     neighbors: DeviceArray  # (B, 27) block number of each neighbour, -1 where there is none
     masks: DeviceArray  # (B, 2) cells that hold points
     support: DeviceArray  # (B, 2) cells that hold enough of them
-    totals: DeviceArray  # (B,) points
-    starts: NDArray[np.int32]  # (B,) first row of each block in `cells`
+    # (B, 3) first row of each block in `cells`, points, bits of the frames that saw it
+    rows: NDArray[np.int32]
     cells: DeviceArray  # (M, 1 + c) root of each cell's count, then mean values times it
 
 
@@ -33,9 +93,9 @@ class Binned:
 class SortedSamples:
     """Single samples of a cloud, sorted by the block (voxel) that they lie in."""
 
-    turn: int
+    loan: Loan
     count: int
-    keys: DeviceArray  # (B, 3)
+    keys: DeviceArray  # (B, 3 or more)
     neighbors: DeviceArray  # (B, 27)
     support: DeviceArray  # (B, 2) cells that hold enough of them
     starts: NDArray[np.int32]  # (B + 1,) block b has samples starts[b] .. starts[b + 1]
@@ -45,11 +105,11 @@ class SortedSamples:
 
 @dataclass(frozen=True)
 class LocalLim:
-    """F', w' of every voxel that a cloud touches (Fig. 5), to be fused into a map by Eq. 19."""
+    """F', w' of every voxel that was touched (Fig. 5), to be fused into a map by Eq. 19."""
 
-    turn: int | None  # of the arena's loan; None: its arrays are its own
+    loan: Loan | None  # None: its arrays are its own
     count: int
-    keys: DeviceArray  # (B, 3)
+    keys: DeviceArray  # (B, 3 or more)
     # (B, r, c) F', then the prior mean; (B, q, 1) sums of the regression for `fusion: information`
     encoded: DeviceArray
     weights: DeviceArray  # (B,) w', points in the doubled voxel; 0 where not encoded
@@ -57,10 +117,22 @@ class LocalLim:
     channels: int  # that were encoded
     first: int = 0  # of them, the first that is meant
 
+    def check(self) -> None:
+        """Raise RuntimeStateError where its loan is over."""
+        if self.loan is not None:
+            self.loan.check()
+
     def part(self, first: int, channels: int) -> LocalLim:
         """The same voxels, of whose channels those from `first` on are meant."""
         assert first + channels <= self.channels
         return replace(self, first=first)
+
+    def parts(self, channels: Sequence[int]) -> list[LocalLim]:
+        """One after the other, the parts of so many channels each."""
+        ends = np.cumsum(channels)
+        return [
+            self.part(int(end) - count, count) for end, count in zip(ends, channels, strict=True)
+        ]
 
     def copy(self) -> LocalLim:
         """The same by value, which no later cloud overwrites."""
@@ -69,6 +141,7 @@ class LocalLim:
             np.ascontiguousarray(a[:n] if isinstance(a, np.ndarray) else a.to_numpy()[:n])
             for a in (self.keys, self.encoded, self.weights, self.support)
         )
+        keys = np.ascontiguousarray(keys[:, :3])
         return replace(
-            self, turn=None, keys=keys, encoded=encoded, weights=weights, support=support
+            self, loan=None, keys=keys, encoded=encoded, weights=weights, support=support
         )

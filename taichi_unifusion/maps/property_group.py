@@ -1,19 +1,69 @@
-"""PropertyGroup: property maps of equal settings, fused from one encoding (Sec. IV-C, VI-I)."""
+"""Groups of maps: property maps of equal settings are fused from one encoding (Sec. IV-C, VI-I)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from .. import runtime
 from ..errors import InputError
 from ..kernels.layout import Layout
-from ..types import PointCloud
+from ..kernels.patches import Patches, Values
+from ..types import Frame, PointCloud
 from .base_map import BaseMap, Integration
 from .binner import Binner
 from .encoder import Encoder
+from .local_lim import LocalLim
 from .property_map import PropertyMap, encode_values
+from .regression_map import RegressionMap
+
+
+SPREAD = 3  # voxels, at most, that the samples beside a block's surfels may bring
+
+
+@dataclass(frozen=True)
+class Part:
+    """Maps whose values are binned and encoded side by side, by the index of the first."""
+
+    maps: tuple[RegressionMap, ...]
+    binner: Binner
+    encoder: Encoder
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(each.name for each in self.maps)
+
+    def carried(self, patches: Patches) -> list[Values]:
+        """What the maps take from patches."""
+        return [each.carried(patches) for each in self.maps]
+
+    def reserve(self, blocks: int) -> None:
+        """Make room for so many voxels more in every map; raises CapacityError."""
+        for each in self.maps:
+            each.grid.reserve(blocks)
+
+    def expect(self, blocks: int, touched: int) -> None:
+        """Make sure that a window of so many blocks, of which `touched` are new, can be fused;
+        raises CapacityError.
+        """
+        for each in self.maps:
+            own = touched if each is self.maps[0] else blocks
+            each.grid.expect(SPREAD * blocks, own)
+
+    def fuse(self, local: LocalLim) -> dict[str, int]:
+        """Fuse to each map its part; by name how many voxels that were."""
+        return {each.name: each.grid.fuse(part) for each, part in self._split(local)}
+
+    def take_out(self, local: LocalLim) -> None:
+        """Undo `fuse`."""
+        for each, part in self._split(local):
+            each.grid.take_out(part)
+
+    def _split(self, local: LocalLim) -> Iterator[tuple[RegressionMap, LocalLim]]:
+        parts = local.parts([each.channels for each in self.maps])
+        return zip(self.maps, parts, strict=True)
 
 
 class MapGroup:
@@ -22,6 +72,13 @@ class MapGroup:
     def __init__(self, maps: Sequence[BaseMap]) -> None:
         self.maps = tuple(maps)
 
+    @property
+    def sums_up(self) -> bool:
+        """Whether these maps can take averages of several frames, or of one on the device."""
+        return not any(
+            isinstance(each, RegressionMap) and not each.sums_up for each in self.maps
+        )
+
     def names_in(self, cloud: PointCloud) -> list[str]:
         """The names of the maps that want a cloud."""
         return [each.name for each in self.maps if each.wants(cloud)]
@@ -29,6 +86,16 @@ class MapGroup:
     def integrate(self, cloud: PointCloud) -> dict[str, Integration]:
         """Fuse a cloud in world coordinates into the maps that want it; by name what that did."""
         return {each.name: each.integrate(cloud) for each in self.maps if each.wants(cloud)}
+
+    def parts(self, frame: Frame) -> list[Part]:
+        """The maps that a frame has something for, and that can take averages of several frames, as
+        they are encoded together.
+        """
+        return [
+            Part((each,), each.binner, each.encoder)
+            for each in self.maps
+            if isinstance(each, RegressionMap) and each.sums_up and each.wants(frame)
+        ]
 
 
 class PropertyGroup(MapGroup):
@@ -73,34 +140,39 @@ class PropertyGroup(MapGroup):
         done = self._integrate_together(finite, cloud)
         return done | {each.name: each.integrate(cloud) for each in present if each not in finite}
 
+    def parts(self, frame: Frame) -> list[Part]:
+        parts = super().parts(frame)
+        # a map whose values are not all finite leaves points out
+        together = [part.maps[0] for part in parts if part.names[0] in frame.carried]
+        if len(together) < 2:
+            return parts
+        return [self._part(together), *(part for part in parts if part.maps[0] not in together)]
+
     def _integrate_together(
         self, maps: Sequence[PropertyMap], cloud: PointCloud
     ) -> dict[str, Integration]:
         """Encode the maps' values side by side, and fuse to each map its part."""
-        lead, channels = maps[0], sum(each.channels for each in maps)
-        runtime.check_alive(lead.grid.runtime)
-        # the first map's index says which voxel is which block
-        binner = Binner(lead.grid, lead.voxel_size, channels)
-        values = [cloud.attributes[each.name] for each in maps]
-        encoder = self._encoder(lead, channels)
-        local = encode_values(binner, encoder, lead.settings, cloud.points, values)
-        for each in maps:  # what does not fit is said before the first of them changes
-            each.grid.reserve(local.count)
-        done, first = {}, 0
         for each in maps:
-            encoded = each.grid.fuse(local.part(first, each.channels))
-            done[each.name] = Integration(len(cloud), encoded, len(each))
-            first += each.channels
-        return done
+            each.flush()
+        part = self._part(maps)
+        runtime.check_alive(part.binner.grid.runtime)
+        local = encode_values(maps, part.binner, part.encoder, cloud)
+        part.reserve(local.count)  # what does not fit is said before the first map changes
+        encoded = part.fuse(local)
+        return {
+            each.name: Integration(len(cloud), encoded[each.name], len(each)) for each in maps
+        }
 
-    def _encoder(self, lead: PropertyMap, channels: int) -> Encoder:
-        """An encoder of so many values a point, which is otherwise that of the maps."""
+    def _part(self, maps: Sequence[RegressionMap]) -> Part:
+        """Maps together: an encoder of all their values which is otherwise that of each."""
+        lead, channels = maps[0], sum(each.channels for each in maps)
         layout = Layout(
             lead.layout.rank, channels, lead.layout.centered, information=lead.layout.information
         )
         if layout not in self._encoders:
             self._encoders[layout] = Encoder(lead.grid.runtime, lead.settings, layout)
-        return self._encoders[layout]
+        binner = Binner(lead.grid, lead.voxel_size, channels)
+        return Part(tuple(maps), binner, self._encoders[layout])
 
 
 def group_maps(maps: Iterable[BaseMap]) -> list[MapGroup]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Self, overload
 
 import numpy as np
@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import InputError
-from ..types import PointCloud
+from ..kernels.patches import Patches, Values
+from ..runtime import DeviceArray
+from ..types import Frame, PointCloud
 from .base_map import check_channels
-from .binner import Binner
+from .binner import Binner, patches_of
 from .encoder import Encoder
 from .local_lim import LocalLim
 from .regression_map import RegressionMap
@@ -52,26 +54,32 @@ class PropertyMap(RegressionMap[PropertySettings]):
     def _empty(cls, name: str, channels: int, settings: PropertySettings) -> Self:
         return cls(name, channels, settings)
 
-    def wants(self, cloud: PointCloud) -> bool:
+    def wants(self, cloud: PointCloud | Frame) -> bool:
         return self.name in cloud.attributes
 
     def observed(self, cloud: PointCloud) -> NDArray[np.float32]:
-        values = cloud.attributes.get(self.name)
+        self._check_carried(cloud.attributes)
+        return cloud.attributes[self.name]
+
+    def carried(self, patches: Patches) -> Values:
+        self._check_carried({name: each.values for name, each in patches.attributes.items()})
+        return patches.attributes[self.name]
+
+    def _check_carried(self, attributes: Mapping[str, DeviceArray]) -> None:
+        values = attributes.get(self.name)
         if values is None:
             raise InputError(
                 f"property map '{self.name}': the cloud has no attribute '{self.name}', only "
-                f"{', '.join(sorted(cloud.attributes)) or 'none'}"
+                f"{', '.join(sorted(attributes)) or 'none'}"
             )
         if values.shape[1] != self.channels:
             raise InputError(
                 f"property map '{self.name}': expected {self.channels} channels, the cloud has "
                 f"{values.shape[1]}"
             )
-        return values
 
     def encode(self, cloud: PointCloud) -> LocalLim:
-        values = [cloud.attributes[self.name]]
-        return encode_values(self.binner, self.encoder, self.settings, cloud.points, values)
+        return encode_values([self], self.binner, self.encoder, cloud)
 
     @overload
     def query(
@@ -92,21 +100,20 @@ class PropertyMap(RegressionMap[PropertySettings]):
         Elsewhere the value is that of the nearest voxel within two, so that a mesh has no black
         rims, and 0 beyond.
         """
+        self.flush()
         runtime.check_alive(self.grid.runtime)
         values, valid = self.decoder.decode(self.grid, points, self.settings.blend, NEAREST_REACH)
         return (values, valid) if return_valid else values
 
 
 def encode_values(
-    binner: Binner,
-    encoder: Encoder,
-    settings: PropertySettings,
-    points: NDArray[np.float32],
-    values: Sequence[NDArray[np.float32]],
+    maps: Sequence[PropertyMap], binner: Binner, encoder: Encoder, cloud: PointCloud
 ) -> LocalLim:
-    """Encode arrays of values (N, c), side by side, at points (N, 3) world [m], from cell averages
-    or each as it is.
+    """Encode what a cloud carries for maps of equal settings, side by side, from averages in cells
+    or each point as it is.
     """
-    if settings.sampling == "points":
-        return encoder.encode_samples(binner.sort(points, np.hstack(values)))
-    return encoder.encode(binner.bin(points, values))
+    if maps[0].settings.sampling == "points":
+        values = np.hstack([each.observed(cloud) for each in maps])
+        return encoder.encode_samples(binner.sort(cloud.points, values))
+    patches = patches_of(cloud, binner.grid.runtime.device)
+    return encoder.encode(binner.bin(patches, [each.carried(patches) for each in maps]))

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..kernels import fusion
 from ..kernels.layout import Layout
+from ..kernels.patches import Patches, Values
 from ..types import PointCloud
 from .base_map import BaseMap, Integration, S
+from .binner import Binner
 from .encoder import Decoder, Encoder
 from .local_lim import LocalLim
 from .voxel_grid import MASKS, WEIGHTS, VoxelData, VoxelField, VoxelGrid, latents
@@ -37,7 +39,7 @@ class RegressionGrid(VoxelGrid):
         Raises RuntimeStateError for a local LIM whose loan is over, CapacityError, with the grid
         unchanged.
         """
-        self.runtime.arena.check_loan(local.turn)
+        local.check()
         slots = np.empty(local.count, np.int32)
         encoded = self.claim(local.count, local.keys, local.weights, slots)
         self._fuse(local, slots, 1.0)
@@ -48,7 +50,7 @@ class RegressionGrid(VoxelGrid):
 
         Support is not cleared: other frames may have set it.
         """
-        self.runtime.arena.check_loan(local.turn)
+        local.check()
         slots = np.empty(local.count, np.int32)
         known = self.find(local.count, local.keys, local.weights, slots)
         self._fuse(local, slots, -1.0)
@@ -91,7 +93,9 @@ class RegressionGrid(VoxelGrid):
 
 
 class RegressionMap(BaseMap[S]):
-    """A map that a subclass gives (x, y) pairs: `observed` and `encode`."""
+    """A map that a subclass gives (x, y) pairs: `observed`, `carried` and `encode`."""
+
+    binner: Binner
 
     def __init__(
         self,
@@ -115,7 +119,13 @@ class RegressionMap(BaseMap[S]):
         self.encoder = Encoder(self.grid.runtime, settings, self.layout)
         self.decoder = Decoder(self.encoder.tables, self.layout, settings.voxel_size)
 
+    @property
+    def sums_up(self) -> bool:
+        """Whether frames can be summed up before they are encoded: not if every point counts."""
+        return self.settings.sampling == "cells"
+
     def integrate(self, cloud: PointCloud) -> Integration:
+        self.flush()
         runtime.check_alive(self.grid.runtime)
         cloud = self.usable(cloud)
         if len(cloud) == 0:
@@ -135,6 +145,7 @@ class RegressionMap(BaseMap[S]):
         cleared; evidence is undone only where frames since have not changed the surface. Removing
         what was never integrated spoils the voxels that it touches.
         """
+        self.flush()
         runtime.check_alive(self.grid.runtime)
         cloud = self.usable(cloud)
         if len(cloud) == 0:
@@ -147,6 +158,12 @@ class RegressionMap(BaseMap[S]):
     def observed(self, cloud: PointCloud) -> NDArray[np.float32]:
         """What this map takes from the cloud beside its points, (N, c); raises InputError where
         that is missing.
+        """
+
+    @abstractmethod
+    def carried(self, patches: Patches) -> Values:
+        """What this map takes from patches beside their points; raises InputError where that is
+        missing.
         """
 
     @abstractmethod

@@ -11,6 +11,7 @@ from ..errors import InputError, check_choice
 from .encoding import EncoderSettings
 
 MAX_RESOLUTION = 32  # mesh cells along a voxel's edge
+MAX_WINDOW = 31  # frames that are fused at once: a voxel has a bit for each
 MAX_FEATURE_RANK = 20  # of a map of features: its kernels unroll over it
 
 

@@ -15,9 +15,10 @@ from .. import runtime
 from ..errors import InputError
 from ..kernels import visibility
 from ..kernels.cells import CELLS
+from ..kernels.patches import Patches, Values
 from ..runtime import DeviceArray
-from ..types import Mesh, PointCloud
-from .binner import SurfelBinner
+from ..types import Frame, Mesh, PinholeCamera, PointCloud
+from .binner import SurfelBinner, patches_of
 from .encoder import to_device
 from .local_lim import LocalLim
 from .meshing import drop_small_parts, extract_mesh
@@ -53,7 +54,7 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         )
         beside = settings.sample_distance
         steps = (0.0,) if derivatives else (-beside, 0.0, beside)
-        self.binner = SurfelBinner(
+        self.binner: SurfelBinner = SurfelBinner(
             self.grid,
             settings.voxel_size,
             np.array(steps, np.float32),
@@ -65,7 +66,7 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
     def _empty(cls, name: str, channels: int, settings: SurfaceSettings) -> Self:
         return cls(settings)
 
-    def wants(self, cloud: PointCloud) -> bool:
+    def wants(self, cloud: PointCloud | Frame) -> bool:
         return True
 
     def observed(self, cloud: PointCloud) -> NDArray[np.float32]:
@@ -78,8 +79,12 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
     def encode(self, cloud: PointCloud) -> LocalLim:
         normals = self.observed(cloud)
         if self.settings.sampling == "cells":
-            return self.encoder.encode(self.binner.bin(cloud.points, [normals]))
+            patches = patches_of(cloud, self.grid.runtime.device)
+            return self.encoder.encode(self.binner.bin(patches, [self.carried(patches)]))
         return self.encoder.encode_samples(self.binner.sort(*self._samples(cloud.points, normals)))
+
+    def carried(self, patches: Patches) -> Values:
+        return Values(patches.normals, patches.counts)
 
     def _samples(
         self, points: NDArray[np.float32], normals: NDArray[np.float32]
@@ -106,17 +111,32 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
                 local.count, local.keys, local.support, grid.index, sign, grid["evidence"]
             )
             return
+        T_camera_world = np.ascontiguousarray(view.T_camera_cloud[None, :3], dtype=np.float32)
+        self.vote(view.values[None], view.camera, T_camera_world, (0, grid.count), sign)
+
+    def vote(
+        self,
+        depth: DeviceArray,
+        camera: PinholeCamera,
+        T_camera_world: NDArray[np.float32],
+        slots: tuple[int, int],
+        sign: int = 1,
+    ) -> None:
+        """Let the depth images (K, H, W) of K views, taken from poses (K, 3, 4), vote in the voxels
+        of a range of slots; with sign -1 they take their votes back.
+        """
+        grid = self.grid
         visibility.vote_cells(
             self.layout.rank,
-            grid.count,
+            *slots,
             grid["keys"],
             grid["masks"],
             grid["latents"],
             self.cell_gradients,
             self.voxel_size,
-            view.values,
-            view.camera.intrinsics,
-            view.T_camera_cloud[:3],
+            depth,
+            camera.intrinsics,
+            T_camera_world,
             sign,
             grid["evidence"],
         )
@@ -133,14 +153,17 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
     def _fuse_voxels(self, data: VoxelData) -> None:
         super()._fuse_voxels(data)
         if data.evidence is not None and len(data):
-            slots = np.empty(len(data), np.int32)
-            self.grid.find(len(data), data.keys, data.weights, slots)
-            visibility.add_evidence(slots, data.evidence, self.grid["evidence"])
+            self.add_evidence(self.grid.slots_of(data.keys), data.evidence)
+
+    def add_evidence(self, slots: NDArray[np.int32], votes: NDArray[np.int8]) -> None:
+        """Add votes (N, 64) for the cells of the voxels in slots (N,)."""
+        visibility.add_evidence(slots, votes, self.grid["evidence"])
 
     def sdf(self, points: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Signed distance (N,) [m] at points (N, 3) world [m], positive in front of the surface,
         and where it is known (N,).
         """
+        self.flush()
         runtime.check_alive(self.grid.runtime)
         values, valid = self.decoder.decode(self.grid, points, blend=True, reach=0)
         return values[:, 0] * np.float32(self.voxel_size), valid
@@ -152,6 +175,7 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         Connected parts of less than `min_area` square metres are left out. Raises InputError for a
         resolution outside 1..32.
         """
+        self.flush()
         runtime.check_alive(self.grid.runtime)
         if not 1 <= resolution <= MAX_RESOLUTION:
             raise InputError(

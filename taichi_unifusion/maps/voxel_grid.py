@@ -11,6 +11,7 @@ import gc
 import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -36,7 +37,8 @@ BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16
 # the voxels of a frame are there before they are counted.
 CUDA_TREE, CUDA_CHUNK, CUDA_RESERVE = 90_000_000, 66_000_000, 330_000_000
 NODES_PER_CHUNK = 16_384
-FIRST_CAPACITY = 4096
+# room to begin with: what a room needs, so that hardly any video waits, but little memory
+FIRST_CAPACITY, LEAST_CAPACITY, FIRST_BYTES = 65_536, 4096, 16 << 20
 
 KEYS = VoxelField("keys", np.dtype(np.int32), (3,))
 WEIGHTS = VoxelField("weights", np.dtype(np.float32))
@@ -100,8 +102,11 @@ class VoxelGrid:
         self.count = 0  # slots given out
         self.empty = 0  # of them, those whose voxel was removed
         self.frame = 0
+        self.unclosed: Any = None  # `CellArrays` with the keys of the voxels that are touched now
         self.index = self._borrow_tree()
-        self._pools = {field.name: Pool(field, FIRST_CAPACITY) for field in (KEYS, *self.fields)}
+        room = FIRST_BYTES // max(field.bytes for field in self.fields)
+        capacity = min(max(room, LEAST_CAPACITY), FIRST_CAPACITY)
+        self._pools = {field.name: Pool(field, capacity) for field in (KEYS, *self.fields)}
         self._leaves, self._touched = 0, 0
         self._inherited = self.runtime.earlier.get(self.index, 0)
         self.runtime.grids.add(self)
@@ -158,22 +163,23 @@ class VoxelGrid:
         self.frame += 1
         return self.frame
 
-    def note_touched(self, voxels: int) -> None:
+    def note_touched(self, voxels: int, spare: int = 0) -> None:
         """Note that voxels were touched, which takes sparse memory also if none is encoded.
 
-        Raises CapacityError before the memory of this map, or of all maps, becomes unsafe.
+        Raises CapacityError before the memory of this map, or of all maps, with `spare` voxels more
+        becomes unsafe.
         """
         self._touched += voxels
         self._note_leaves()
-        if self._alone_too_large() or _too_large(self.runtime):
+        if self._alone_too_large(spare) or _too_large(self.runtime, spare):
             _recount(self.runtime)
-        if self._alone_too_large():
+        if self._alone_too_large(spare):
             raise CapacityError(
                 f"the map holds {self.count:,} voxels and its index would pass "
                 f"{SPARSE_LIMIT / 1e9:.1f} GB, where Taichi is no longer safe: use larger voxels or "
                 "save the map and start a new one"
             )
-        if _too_large(self.runtime):
+        if _too_large(self.runtime, spare):
             raise CapacityError(
                 f"the indices of all maps of this process, {len(self.runtime.grids)} now and those "
                 f"before, would pass {_index_room(self.runtime) / 1e9:.2f} GB, where Taichi is no "
@@ -190,14 +196,24 @@ class VoxelGrid:
         """What the tree has now, at most; memory that it had for an earlier map stays with it."""
         self.runtime.leaves[self.index] = max(self._inherited, self._leaves + self._touched)
 
-    def _alone_too_large(self) -> bool:
-        return (self._leaves + self._touched) * BYTES_PER_LEAF > SPARSE_LIMIT
+    def _alone_too_large(self, spare: int) -> bool:
+        return (self._leaves + self._touched + spare) * BYTES_PER_LEAF > SPARSE_LIMIT
 
     def reserve(self, extra: int) -> None:
         """Make room for `extra` more voxels; raises CapacityError before sparse memory becomes
         unsafe, or a pool larger than an array can be.
         """
         self.note_touched(extra)
+        self._make_room(extra)
+
+    def expect(self, extra: int, touched: int) -> None:
+        """Make room for `extra` more voxels that come later, of which `touched` were touched now;
+        raises as `reserve`.
+        """
+        self.note_touched(touched, spare=extra)
+        self._make_room(extra)
+
+    def _make_room(self, extra: int) -> None:
         needed = self.count + extra
         if needed <= self.capacity:
             return
@@ -228,6 +244,13 @@ class VoxelGrid:
         kernels.find_slots(blocks, keys, weights, self.index, found, slots)
         runtime.synchronize()
         return int(found[0])
+
+    def slots_of(self, keys: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (N,) of voxels (N, 3), -1 where there is none."""
+        slots = np.empty(len(keys), np.int32)
+        if len(keys):
+            self.find(len(keys), np.ascontiguousarray(keys), np.ones(len(keys), np.float32), slots)
+        return slots
 
     def release(self, blocks: int, keys: DeviceArray, slots: DeviceArray) -> None:
         """Give up the voxels of `slots` that have no weight left."""
@@ -317,8 +340,11 @@ def _index_room(live: runtime.Runtime) -> int:
     return SPARSE_POOL if live.device == "cpu" else live.sparse_pool - CUDA_RESERVE
 
 
-def _too_large(live: runtime.Runtime) -> bool:
-    return _index_bytes(live) > _index_room(live)
+def _too_large(live: runtime.Runtime, spare: int = 0) -> bool:
+    """Whether all maps, with `spare` leaves more, take more than is safe."""
+    chunk = -(-spare // NODES_PER_CHUNK) * CUDA_CHUNK
+    more = spare * BYTES_PER_LEAF if live.device == "cpu" else chunk
+    return _index_bytes(live) + more > _index_room(live)
 
 
 def _recount(live: runtime.Runtime) -> None:

@@ -1,0 +1,362 @@
+"""Window: consecutive frames that see the same voxels, summed up in one set of cells, and encoded,
+fused and voted once: the local LIM of a window (Fig. 5, Sec. IV-E).
+
+Sums are whole numbers, so frames of a window may come in any order, and one that is refused leaves
+no trace. Noise d of the regression is a frame's: a voxel that n frames of the window saw is
+regressed with n d.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from ..errors import UniFusionError
+from ..geometry.se3 import distance, inverse
+from ..kernels.patches import Patches, Targets
+from ..runtime import Arena, DeviceArray
+from ..types import Frame, PinholeCamera
+from .kept_window import KeptCells, KeptWindow, Visible, VisibleChange, take_visible
+from .local_lim import CellArrays, OpenCells
+from .property_group import MapGroup, Part
+from .regression_map import RegressionMap
+from .surface_map import SurfaceMap
+
+# A window ends where the camera has moved this far from its first frame [m, degrees]: from there
+# fewer voxels are shared, and a window that a loop moves would bend.
+FARTHEST_MOVE, LARGEST_TURN = 0.3, 15.0
+GAP = 3  # a step between frames that is so many times the usual one ends a window
+ROOM = 256 << 20  # bytes of a part's sums, or of depth images, beyond which a window ends
+VOTE_PIECES = 20
+NEVER = 2**31 - 1  # as the first block to add to
+PIECE = 10_000  # blocks encoded at once, times the rank
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some milliseconds of the work that fuses a window."""
+
+    name: str  # of the maps that it is for
+    work: Callable[[], None]
+
+
+Keep = Callable[[KeptWindow], None]
+
+
+class FindPatches(Protocol):
+    """Makes the patches of a frame, and sums them up in the cells of targets."""
+
+    def __call__(self, targets: Targets, *, write: bool) -> Patches: ...
+
+
+@dataclass
+class OpenPart:
+    """What a window sums up for the maps of one part."""
+
+    part: Part
+    cells: OpenCells
+    arena: Arena  # of what comes out of them
+
+    @property
+    def bytes(self) -> int:
+        return self.cells.count * self.cells.arrays.block_bytes
+
+
+@dataclass
+class Window:
+    """Frames that are summed up. The first one is the keyframe; all carry the same, and were taken
+    by the same camera.
+    """
+
+    T_world_keyframe: NDArray[np.float64]
+    camera: PinholeCamera
+    carried: frozenset[str]  # what each frame carries
+    images: DeviceArray  # (K, H, W) [m] depth of the views
+    parts: dict[tuple[str, ...], OpenPart]  # by the names of their maps
+    others: bool  # whether other maps want patches too
+    T_camera_world: list[NDArray[np.float64]] = field(default_factory=list)  # of the views
+
+    def __len__(self) -> int:
+        """Frames summed up."""
+        return len(self.T_camera_world)
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no room for another frame."""
+        most = max(each.bytes for each in self.parts.values())
+        return len(self) == self.images.shape[0] or most > ROOM
+
+    def is_near(self, frame: Frame) -> bool:
+        """Whether a frame was taken by the same camera from about the same place."""
+        moved, turned = distance(self.T_world_keyframe, frame.require_pose())
+        near = moved <= FARTHEST_MOVE and np.degrees(turned) <= LARGEST_TURN
+        return near and frame.camera == self.camera
+
+    def add(self, frame: Frame, find: FindPatches, reach: float) -> tuple[Patches, dict[str, int]]:
+        """Sum up a frame, whose depth image is already there; returns its patches, and by name how
+        many voxels of a map were not in the window before.
+
+        Patches within `reach` [m] of the camera are added to the cells of the surface and of the
+        colours while they are made; other parts bin them afterwards. A frame without any is not
+        added. Raises OutOfRange for points beyond a map's index range, CapacityError where a map
+        would grow beyond safe memory; the window is then unchanged.
+        """
+        before = {names: each.cells for names, each in self.parts.items()}
+        direct = [self._direct(names, frame, reach) for names in (("surface",), ("color",))]
+        try:
+            patches = self._sum_up(direct, find)
+            for names, each in self.parts.items():
+                if each not in direct and patches.total:
+                    each.cells = each.part.binner.touch(each.cells, patches)
+                each.part.expect(each.cells.count, each.cells.count - before[names].count)
+        except UniFusionError:
+            find(self._targets(direct, sign=-1), write=False)
+            for names, each in self.parts.items():
+                each.part.binner.forget(each.cells, before[names])
+                each.cells = before[names]
+            raise
+        if patches.total == 0:
+            return patches, {}
+        for each in self.parts.values():
+            if each not in direct:
+                each.part.binner.add(each.cells, patches, each.part.carried(patches), len(self))
+        self.T_camera_world.append(inverse(frame.require_pose()))
+        touched = {
+            name: each.cells.count - before[names].count
+            for names, each in self.parts.items()
+            for name in names
+        }
+        return patches, touched
+
+    def _direct(self, names: tuple[str, ...], frame: Frame, reach: float) -> OpenPart | None:
+        """The part of surface or colour alone, if all that a frame may see lies in its range."""
+        part = self.parts.get(names)
+        if part is None or not part.part.binner.reaches(frame.require_pose(), reach):
+            return None
+        return part if names != ("color",) or "color" not in frame.images else None
+
+    def _targets(
+        self, direct: Sequence[OpenPart | None], first: tuple[int, int] = (0, 0), sign: int = 1
+    ) -> Targets:
+        surface, color = [each and each.part.binner.target(each.cells) for each in direct]
+        return Targets(len(self), surface, color, first, sign)
+
+    def _sum_up(self, direct: Sequence[OpenPart | None], find: FindPatches) -> Patches:
+        """Make a frame's patches and add them to the cells of some parts on the way; those of blocks
+        that there was no room for come in a second round.
+        """
+        write = len(self.parts) > sum(each is not None for each in direct) or self.others
+        room = [each.cells.arrays.room if each else 0 for each in direct]
+        patches = find(self._targets(direct), write=write)
+        for each, blocks in zip(direct, patches.blocks, strict=True):
+            if each is not None:
+                each.cells = replace(each.cells, count=blocks)
+        if any(blocks > n for blocks, n in zip(patches.blocks, room, strict=True)):
+            for each, n in zip(direct, room, strict=True):
+                if each is not None:
+                    each.cells.arrays.reserve_keys(each.cells.count, min(n, each.cells.count))
+                    each.cells.arrays.reserve(each.cells.count, min(n, each.cells.count))
+            first = [n if blocks > n else NEVER for blocks, n in zip(patches.blocks, room, strict=True)]
+            find(self._targets(direct, (first[0], first[1])), write=False)
+        return patches
+
+    def close(self, keep: Keep | None = None) -> list[Piece]:
+        """The work that fuses the window, in order; the sums are free for another one. `keep` is
+        told in the end what it was.
+        """
+        cells = {names: KeptCells.of(each.cells) for names, each in self.parts.items() if keep}
+        pieces = [piece for each in self.parts.values() for piece in self._pieces(each)]
+        if keep is None:
+            return pieces
+        name, surfaces, before = pieces[0].name, self.surfaces, {}
+        first = Piece(name, lambda: before.update({s.name: Visible.of(s.grid) for s in surfaces}))
+        return [first, *pieces, Piece(name, lambda: keep(self._kept(cells, before)))]
+
+    @property
+    def surfaces(self) -> list[SurfaceMap]:
+        """The maps in which rays vote."""
+        maps = [each for part in self.parts.values() for each in part.part.maps]
+        return [each for each in maps if isinstance(each, SurfaceMap) and each.settings.carve]
+
+    def _kept(
+        self, cells: Mapping[tuple[str, ...], KeptCells], before: Mapping[str, Visible]
+    ) -> KeptWindow:
+        changes = {s.name: VisibleChange.since(before[s.name], s.grid) for s in self.surfaces}
+        depth = self.images.to_numpy()[: len(self)]
+        return KeptWindow(
+            self.T_world_keyframe, self.camera, depth, self._poses(), cells, changes
+        )
+
+    def _poses(self) -> NDArray[np.float32]:
+        """(K, 3, 4) T_camera_world of the views."""
+        return np.array([T[:3] for T in self.T_camera_world], np.float32)
+
+    def _pieces(self, part: OpenPart) -> Iterator[Piece]:
+        name, encoder = " + ".join(part.part.names), part.part.encoder
+        binned = part.part.binner.close(part.cells, part.arena)
+        local = encoder.room(binned)
+        step = PIECE // encoder.layout.size
+        for begin in range(0, binned.count, step):
+            end = min(begin + step, binned.count)
+            yield Piece(name, partial(encoder.encode_blocks, binned, begin, end, local))
+        yield Piece(name, partial(part.part.fuse, local))
+        for each in self.surfaces:
+            if each in part.part.maps:
+                for n in range(VOTE_PIECES):
+                    yield Piece(name, partial(self._vote, each, n))
+
+    def _vote(self, surface: SurfaceMap, piece: int) -> None:
+        """Let all views vote in one of the parts of a map."""
+        count = surface.grid.count
+        slots = piece * count // VOTE_PIECES, (piece + 1) * count // VOTE_PIECES
+        surface.vote(self.images, self.camera, self._poses(), slots)
+
+
+class WindowFusion:
+    """Sums frames up in windows of `size` frames at most, and fuses full ones piece by piece while
+    the next one fills, so that no frame of a video waits for a whole window.
+
+    A size of 1 fuses every frame by itself, at once. `keep` is told of every window that was fused,
+    so that it can be taken out.
+    """
+
+    def __init__(self, size: int, keep: Keep | None = None) -> None:
+        self.size, self.keep = size, keep
+        self.window: Window | None = None
+        self.pieces: deque[Piece] = deque()
+        self._maps: set[RegressionMap] = set()  # that wait
+        self._index, self._stride = 0, 0  # of the last frame in its recording, and the usual step
+        self._room: dict[tuple[str, ...], tuple[CellArrays, Arena]] = {}
+        self._known: dict[tuple[str, ...], Part] = {}
+        self._images: list[DeviceArray] = []  # of the open window, and of the one before
+
+    def place(self, frame: Frame) -> tuple[DeviceArray, int]:
+        """Images (K, H, W) and the one of them that a frame's depth belongs to; ends the window
+        that it does not fit into.
+        """
+        if self.window is not None and not self._continues(self.window, frame):
+            self.close()
+        if self.window is None:
+            return self._free_images(frame), 0
+        return self.window.images, len(self.window)
+
+    def add(
+        self,
+        frame: Frame,
+        find: FindPatches,
+        reach: float,
+        groups: Sequence[MapGroup],
+        others: bool,
+    ) -> tuple[Patches, dict[str, int]]:
+        """Sum up a frame that `place` was asked for, for the maps of `groups`; whether `others` want
+        its patches too. Returns and raises as `Window.add`, with nothing changed where it raises.
+        """
+        parts = [part for group in groups for part in group.parts(frame)]
+        window = self.window or Window(
+            frame.require_pose(),
+            frame.camera,
+            frame.carried,
+            self._images[0],
+            {part.names: self._open(part) for part in parts},
+            others,
+        )
+        patches, touched = window.add(frame, find, reach)
+        if patches.total == 0:
+            return patches, touched
+        if self._index and not self._stride:
+            self._stride = abs(frame.index - self._index)
+        self.window, self._index = window, frame.index
+        for part in parts:
+            for each in part.maps:
+                each.waiting = self
+                self._maps.add(each)
+        if window.full:
+            self.close()
+        return patches, touched
+
+    def close(self) -> None:
+        """End the window: what fuses it waits in `pieces`, after what was there before."""
+        if self.window is not None:
+            self.run(len(self.pieces))
+            self.pieces.extend(self.window.close(self.keep))
+            self.window = None
+            self._images.reverse()
+
+    def due(self) -> Iterator[Piece]:
+        """The pieces to do now, so that all are done when the next window is full."""
+        frames_left = self.size - len(self.window) if self.window else self.size
+        for _ in range(-(-len(self.pieces) // max(frames_left, 1))):
+            yield self.pieces.popleft()
+        self._release()
+
+    def run(self, count: int) -> None:
+        """Do the next `count` pieces."""
+        for _ in range(count):
+            self.pieces.popleft().work()
+
+    def flush(self) -> None:
+        """Fuse all frames that were summed up."""
+        self.close()
+        self.run(len(self.pieces))
+        self._release()
+
+    def take_out(self, kept: KeptWindow) -> None:
+        """Undo what fusing a window did to the maps, which then hold what they did before; windows
+        that were fused since stay.
+        """
+        self.flush()
+        for names, cells in kept.cells.items():
+            part, arrays = self._known[names], self._room[names][0]
+            for each in part.maps:
+                if each.name in kept.visible:
+                    take_visible(each, kept.visible[each.name])
+            part.take_out(cells.encoded(part, arrays))
+
+    def put_back(self, kept: KeptWindow) -> KeptWindow:
+        """Fuse a window again that was taken out; returns it with what its rays changed this time."""
+        self.flush()
+        changes = {}
+        for names, cells in kept.cells.items():
+            part, arrays = self._known[names], self._room[names][0]
+            surfaces = [each for each in part.maps if each.name in kept.visible]
+            before = {each.name: Visible.of(each.grid) for each in surfaces}
+            part.fuse(cells.encoded(part, arrays))
+            for each in surfaces:
+                slots = (0, each.grid.count)
+                each.vote(kept.depth, kept.camera, kept.T_camera_world, slots)
+                changes[each.name] = VisibleChange.since(before[each.name], each.grid)
+        return replace(kept, visible=changes)
+
+    def _release(self) -> None:
+        """Let go of the maps if nothing waits for them."""
+        if self.window is None and not self.pieces:
+            for each in self._maps:
+                each.waiting = None
+            self._maps.clear()
+
+    def _continues(self, window: Window, frame: Frame) -> bool:
+        gap = self._stride and abs(frame.index - self._index) > GAP * self._stride
+        return not gap and frame.carried == window.carried and window.is_near(frame)
+
+    def _open(self, part: Part) -> OpenPart:
+        if part.names not in self._room:
+            self._room[part.names] = CellArrays(part.binner.width), Arena()
+        self._known[part.names] = part
+        arrays, arena = self._room[part.names]
+        return OpenPart(part, part.binner.open(arrays), arena)
+
+    def _free_images(self, frame: Frame) -> DeviceArray:
+        """Room for the views of a window that begins; those of the one before may still vote."""
+        count = min(self.size, max(ROOM // frame.depth.nbytes, 1))
+        shape = (count, *frame.depth.shape)
+        if not self._images or self._images[0].shape != shape:
+            self.run(len(self.pieces))
+            self._images = [ti.ndarray(ti.f32, shape) for _ in range(2 if self.size > 1 else 1)]
+        return self._images[0]
