@@ -16,7 +16,13 @@ import yaml
 
 from .errors import ConfigError, InputError, convert, did_you_mean, shortened
 from .files.strict_yaml import read_yaml
-from .maps.settings import MAX_RESOLUTION, MAX_WINDOW, FeatureSettings, PropertySettings, SurfaceSettings
+from .maps.settings import (
+    MAX_RESOLUTION,
+    MAX_WINDOW,
+    FeatureSettings,
+    PropertySettings,
+    SurfaceSettings,
+)
 from .preprocessing import PreprocessSettings
 from .tracking.base import TrackingSettings
 

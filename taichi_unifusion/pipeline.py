@@ -18,8 +18,8 @@ from . import runtime
 from .config import Config
 from .datasets.loading import load_ahead
 from .errors import FrameError, InputError, UniFusionError
-from .language.source import FeatureSource
 from .kernels.patches import Patches
+from .language.source import FeatureSource
 from .maps import BaseMap, FeatureMap, Integration, PropertyMap, SurfaceMap
 from .maps.property_group import group_maps
 from .maps.window import WindowFusion
@@ -105,7 +105,9 @@ class Pipeline:
         with clock.stage("sum"):
             find = partial(find_patches, frame, self._preprocess, inverse, T_world_camera)
             reach = self._preprocess.depth_max * frame.camera.longest_ray
-            patches, touched = self.fusion.add(frame, find, reach, self.groups, bool(frame.features))
+            patches, touched = self.fusion.add(
+                frame, find, reach, self.groups, bool(frame.features)
+            )
         if patches.total == 0:
             raise EmptyFrame(f"{frame.label}: {_why_empty(frame, self.config.preprocess)}")
         for piece in self.fusion.due():

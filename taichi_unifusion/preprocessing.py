@@ -207,9 +207,7 @@ def normal_image(frame: Frame, settings: PreprocessSettings | None = None) -> ND
 
     settings = settings or PreprocessSettings()
     depth = np.empty_like(frame.depth)
-    clip_depth(
-        np.ascontiguousarray(frame.depth), settings.depth_min, settings.depth_max, depth
-    )
+    clip_depth(np.ascontiguousarray(frame.depth), settings.depth_min, settings.depth_max, depth)
     normals = np.empty((*depth.shape, 3), np.float32)
     estimate_normals(
         np.divide(1.0, depth, where=depth > 0, out=np.zeros_like(depth)),

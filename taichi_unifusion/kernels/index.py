@@ -115,19 +115,6 @@ def touch_points(
 
 
 @ti.kernel
-def block_of_points(
-    # in:
-    points: Floats2,  # (N, 3) world [m], in touched voxels
-    per_meter: ti.f32,
-    index: ti.template(),
-    # out:
-    blocks: Ints1,  # (N,)
-):
-    for n in range(points.shape[0]):
-        blocks[n] = block_in(index, voxel_of(row3(points, n) * per_meter))
-
-
-@ti.kernel
 def forget_blocks(
     # in:
     first: ti.i32,

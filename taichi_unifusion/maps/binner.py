@@ -193,7 +193,9 @@ class Binner:
         def borrow(name: str, dtype: Any, *row: int) -> DeviceArray:
             return arena.borrow(name, dtype, (max(n, FIRST_BLOCKS), *row))
 
-        keys = borrow("keys", ti.i32, KEY_COLUMNS)  # a copy: the next window begins before this one is fused
+        keys = borrow(
+            "keys", ti.i32, KEY_COLUMNS
+        )  # a copy: the next window begins before this one is fused
         copy_rows(n, arrays.keys, keys)
         masks, support = borrow("masks", ti.u32, 2), borrow("support", ti.u32, 2)
         neighbors, rows = borrow("neighbors", ti.i32, 27), np.empty((n, 3), np.int32)
@@ -236,9 +238,7 @@ class SurfelBinner(Binner):
         support_points: int,
         with_normals: bool,
     ) -> None:
-        super().__init__(
-            grid, voxel_size, 3, support_points=support_points, with_positions=True
-        )
+        super().__init__(grid, voxel_size, 3, support_points=support_points, with_positions=True)
         self.steps, self.with_normals = steps, with_normals
 
     def close(self, cells: OpenCells, arena: Arena) -> Binned:
@@ -280,9 +280,7 @@ def patches_of(cloud: PointCloud, device: str) -> Patches:
     counts = np.ones(n, np.int32) if cloud.counts is None else cloud.counts
     attributes = {name: Values(values, counts) for name, values in cloud.attributes.items()}
     pixels = int(counts.sum())
-    return Patches(
-        slots, found, cloud.points, counts, cloud.normals, attributes, n, pixels, (0, 0)
-    )
+    return Patches(slots, found, cloud.points, counts, cloud.normals, attributes, n, pixels, (0, 0))
 
 
 def _side_by_side(arrays: Sequence[DeviceArray]) -> NDArray[np.float32]:

@@ -48,7 +48,9 @@ class KeptCells:
     def encoded(self, part: Part, arrays: CellArrays) -> LocalLim:
         """The local LIM of a part, as it was fused; on loan from the arena of the runtime."""
         binner, n = part.binner, len(self.keys)
-        centers = ((self.keys[:, :3] + np.float32(0.5)) * np.float32(binner.voxel_size)).astype(np.float32)
+        centers = ((self.keys[:, :3] + np.float32(0.5)) * np.float32(binner.voxel_size)).astype(
+            np.float32
+        )
         patches = patches_of(PointCloud(centers), binner.grid.runtime.device)
         touched = binner.touch(binner.open(arrays), patches)
         # blocks have other numbers now

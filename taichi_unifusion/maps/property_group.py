@@ -19,7 +19,6 @@ from .local_lim import LocalLim
 from .property_map import PropertyMap, encode_values
 from .regression_map import RegressionMap
 
-
 SPREAD = 3  # voxels, at most, that the samples beside a block's surfels may bring
 
 
@@ -75,9 +74,7 @@ class MapGroup:
     @property
     def sums_up(self) -> bool:
         """Whether these maps can take averages of several frames, or of one on the device."""
-        return not any(
-            isinstance(each, RegressionMap) and not each.sums_up for each in self.maps
-        )
+        return not any(isinstance(each, RegressionMap) and not each.sums_up for each in self.maps)
 
     def names_in(self, cloud: PointCloud) -> list[str]:
         """The names of the maps that want a cloud."""
@@ -159,9 +156,7 @@ class PropertyGroup(MapGroup):
         local = encode_values(maps, part.binner, part.encoder, cloud)
         part.reserve(local.count)  # what does not fit is said before the first map changes
         encoded = part.fuse(local)
-        return {
-            each.name: Integration(len(cloud), encoded[each.name], len(each)) for each in maps
-        }
+        return {each.name: Integration(len(cloud), encoded[each.name], len(each)) for each in maps}
 
     def _part(self, maps: Sequence[RegressionMap]) -> Part:
         """Maps together: an encoder of all their values which is otherwise that of each."""

@@ -163,7 +163,9 @@ class Window:
                 if each is not None:
                     each.cells.arrays.reserve_keys(each.cells.count, min(n, each.cells.count))
                     each.cells.arrays.reserve(each.cells.count, min(n, each.cells.count))
-            first = [n if blocks > n else NEVER for blocks, n in zip(patches.blocks, room, strict=True)]
+            first = [
+                n if blocks > n else NEVER for blocks, n in zip(patches.blocks, room, strict=True)
+            ]
             find(self._targets(direct, (first[0], first[1])), write=False)
         return patches
 
@@ -190,9 +192,7 @@ class Window:
     ) -> KeptWindow:
         changes = {s.name: VisibleChange.since(before[s.name], s.grid) for s in self.surfaces}
         depth = self.images.to_numpy()[: len(self)]
-        return KeptWindow(
-            self.T_world_keyframe, self.camera, depth, self._poses(), cells, changes
-        )
+        return KeptWindow(self.T_world_keyframe, self.camera, depth, self._poses(), cells, changes)
 
     def _poses(self) -> NDArray[np.float32]:
         """(K, 3, 4) T_camera_world of the views."""
