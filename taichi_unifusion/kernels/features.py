@@ -23,7 +23,8 @@ import taichi as ti
 
 from .arrays import Bytes1, Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, Rows2, row3
 from .cells import cell_bit, cell_center, cells_before, first_cell
-from .regression import cell_row, neighbor_step, worker_stride
+from .regression import cell_row, neighbor_step
+from .tasks import worker_stride
 
 # cells of a doubled voxel, 512 at most; not a power of two: rows would map to the same cache sets
 ENTRIES = 528

@@ -18,6 +18,7 @@ from .camera import Intrinsics, Pose, lift, move, ray, rotate
 from .cells import CELLS
 from .images import inverse_depth_slope, segment, segments
 from .index import INDEX_HALF, Index
+from .tasks import small_stride
 
 QUAD = 4  # pixels, at most as many patches
 IS_NUMBER = 0x7F800000  # bits of a float, without its sign, below this
@@ -226,118 +227,129 @@ def make_patches(
     runs = (across + quads - 1) // quads
     jump, cos_max_angle, least = rules[0], rules[1], rules[2]
     sign, frame = now[0], 1 << now[1]
-    for part in range((height + 1) // 2 * runs):
-        row, start = part // runs, part % runs * quads
-        n, pixels = part * ti.static(slots_of_run()), 0
-        # runs of patches in one cell, of the surface and of the colours: a run costs one write
-        place_s = ti.Vector([INDEX_HALF * CELLS, 0, 0])
-        place_c = ti.Vector([INDEX_HALF * CELLS, 0, 0])
-        block_s, block_c, run_s, run_c = 0, 0, 0, 0
-        total_s, total_c = ti.Vector([0.0] * 6), ti.Vector([0.0] * 3)
-        for column in range(start, ti.min(start + quads, across)):
-            of, slope_u, slope_v, known = 0.0, 0.0, 0.0, False  # slopes of a surface, and its depth
-            count, mask = 0, 0
-            normal, x = ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0])
-            for p in range(QUAD + 1):  # the last round is for what is left
-                v, u = row * 2 + p // 2, column * 2 + p % 2
-                q = 0.0
-                if p < QUAD:
-                    if v < height:
-                        if u < width:
-                            q = inverse[v, u]
-                other = ti.abs(q - of) > 0.5 * jump * q
-                if count > 0:
-                    if p == QUAD or (q > 0 and (other or q < least)):
-                        weight = ti.cast(count, ti.f32)
-                        x = move(T_world_camera, x / weight)
-                        if ti.static(sinks.write):
-                            for d in ti.static(range(3)):
-                                patches.points[n, d], patches.normals[n, d] = x[d], normal[d]
-                            patches.counts[n] = count
-                            patches.places[n] = (row * across + column) * 16 + mask
-                        if ti.static(sinks.has_surface):
-                            y = x * ti.static(sinks.surface.per_meter * CELLS)
-                            at = ti.floor(y, ti.i32)
-                            if any(at != place_s):
-                                if run_s > 0 and block_s >= now[4]:
-                                    add_run(6, block_s, place_s, run_s, total_s, sign, sums_s)
-                                if any((at >> 2) != (place_s >> 2)):
-                                    block_s = claim_block(
-                                        at >> 2,
-                                        now[2],
-                                        2,
-                                        now[4],
-                                        sinks.surface.index,
-                                        sums_s.shape[0],
-                                        totals,
-                                        keys_s,
-                                    )
-                                    if block_s < sums_s.shape[0]:
-                                        mark_frame(block_s, frame, sign, keys_s)
-                                place_s = at
-                                run_s = 0
-                                total_s.fill(0.0)
-                            if block_s < sums_s.shape[0]:
-                                run_s += count
+    stride = ti.static(small_stride())
+    for i in range((height + 1) // 2 * runs * stride):
+        if i % stride == 0:
+            part = i // stride
+            row, start = part // runs, part % runs * quads
+            n, pixels = part * ti.static(slots_of_run()), 0
+            # runs of patches in one cell, of the surface and of the colours: a run costs one write
+            place_s = ti.Vector([INDEX_HALF * CELLS, 0, 0])
+            place_c = ti.Vector([INDEX_HALF * CELLS, 0, 0])
+            block_s, block_c, run_s, run_c = 0, 0, 0, 0
+            total_s, total_c = ti.Vector([0.0] * 6), ti.Vector([0.0] * 3)
+            for column in range(start, ti.min(start + quads, across)):
+                of, slope_u, slope_v, known = (
+                    0.0,
+                    0.0,
+                    0.0,
+                    False,
+                )  # slopes of a surface, and its depth
+                count, mask = 0, 0
+                normal, x = ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0])
+                for p in range(QUAD + 1):  # the last round is for what is left
+                    v, u = row * 2 + p // 2, column * 2 + p % 2
+                    q = 0.0
+                    if p < QUAD:
+                        if v < height:
+                            if u < width:
+                                q = inverse[v, u]
+                    other = ti.abs(q - of) > 0.5 * jump * q
+                    if count > 0:
+                        if p == QUAD or (q > 0 and (other or q < least)):
+                            weight = ti.cast(count, ti.f32)
+                            x = move(T_world_camera, x / weight)
+                            if ti.static(sinks.write):
                                 for d in ti.static(range(3)):
-                                    total_s[d] += normal[d] * weight
-                                    total_s[3 + d] += (y[d] - at[d] - 0.5) / CELLS * weight
-                        if ti.static(sinks.has_color):
-                            at = ti.floor(x * ti.static(sinks.color.per_meter * CELLS), ti.i32)
-                            if any(at != place_c):
-                                if run_c > 0 and block_c >= now[5]:
-                                    add_run(3, block_c, place_c, run_c, total_c, sign, sums_c)
-                                if any((at >> 2) != (place_c >> 2)):
-                                    block_c = claim_block(
-                                        at >> 2,
-                                        now[3],
-                                        3,
-                                        now[5],
-                                        sinks.color.index,
-                                        sums_c.shape[0],
-                                        totals,
-                                        keys_c,
+                                    patches.points[n, d], patches.normals[n, d] = x[d], normal[d]
+                                patches.counts[n] = count
+                                patches.places[n] = (row * across + column) * 16 + mask
+                            if ti.static(sinks.has_surface):
+                                y = x * ti.static(sinks.surface.per_meter * CELLS)
+                                at = ti.floor(y, ti.i32)
+                                if any(at != place_s):
+                                    if run_s > 0 and block_s >= now[4]:
+                                        add_run(6, block_s, place_s, run_s, total_s, sign, sums_s)
+                                    if any((at >> 2) != (place_s >> 2)):
+                                        block_s = claim_block(
+                                            at >> 2,
+                                            now[2],
+                                            2,
+                                            now[4],
+                                            sinks.surface.index,
+                                            sums_s.shape[0],
+                                            totals,
+                                            keys_s,
+                                        )
+                                        if block_s < sums_s.shape[0]:
+                                            mark_frame(block_s, frame, sign, keys_s)
+                                    place_s = at
+                                    run_s = 0
+                                    total_s.fill(0.0)
+                                if block_s < sums_s.shape[0]:
+                                    run_s += count
+                                    for d in ti.static(range(3)):
+                                        total_s[d] += normal[d] * weight
+                                        total_s[3 + d] += (y[d] - at[d] - 0.5) / CELLS * weight
+                            if ti.static(sinks.has_color):
+                                at = ti.floor(x * ti.static(sinks.color.per_meter * CELLS), ti.i32)
+                                if any(at != place_c):
+                                    if run_c > 0 and block_c >= now[5]:
+                                        add_run(3, block_c, place_c, run_c, total_c, sign, sums_c)
+                                    if any((at >> 2) != (place_c >> 2)):
+                                        block_c = claim_block(
+                                            at >> 2,
+                                            now[3],
+                                            3,
+                                            now[5],
+                                            sinks.color.index,
+                                            sums_c.shape[0],
+                                            totals,
+                                            keys_c,
+                                        )
+                                        if block_c < sums_c.shape[0]:
+                                            mark_frame(block_c, frame, sign, keys_c)
+                                    place_c = at
+                                    run_c = 0
+                                    total_c.fill(0.0)
+                                if block_c < sums_c.shape[0]:
+                                    run_c += count
+                                    total_c += (
+                                        patch_color(color, row * 2, column * 2, mask, count)
+                                        * weight
                                     )
-                                    if block_c < sums_c.shape[0]:
-                                        mark_frame(block_c, frame, sign, keys_c)
-                                place_c = at
-                                run_c = 0
-                                total_c.fill(0.0)
-                            if block_c < sums_c.shape[0]:
-                                run_c += count
-                                total_c += (
-                                    patch_color(color, row * 2, column * 2, mask, count) * weight
-                                )
-                        n += 1
-                        pixels += count
-                        count, mask = 0, 0
-                        x.fill(0.0)
-                if q > 0:
-                    if other or not known:
-                        of = q
-                        slope_u, slope_v, known = inverse_depth_slope(inverse, v, u, radius, jump)
-                    good = count > 0
-                    if not good:
-                        if known:
-                            along_z = q - slope_u * (u - K[2]) - slope_v * (v - K[3])
-                            m = ti.Vector([slope_u * K[0], slope_v * K[1], along_z]) / q
-                            # m . ray = 1
-                            good = cos_max_angle * m.norm() * ray(u, v, K).norm() <= 1.0
-                            normal = -rotate(T_world_camera, m).normalized()
-                    if good:
-                        count += 1
-                        mask |= 1 << p
-                        x += lift(u, v, 1.0 / q, K)
-        if ti.static(sinks.has_surface):
-            if run_s > 0 and block_s >= now[4]:
-                add_run(6, block_s, place_s, run_s, total_s, sign, sums_s)
-        if ti.static(sinks.has_color):
-            if run_c > 0 and block_c >= now[5]:
-                add_run(3, block_c, place_c, run_c, total_c, sign, sums_c)
-        if ti.static(sinks.write):
-            patches.found[part] = n - part * ti.static(slots_of_run())
-        ti.atomic_add(totals[0], n - part * ti.static(slots_of_run()))
-        ti.atomic_add(totals[1], pixels)
+                            n += 1
+                            pixels += count
+                            count, mask = 0, 0
+                            x.fill(0.0)
+                    if q > 0:
+                        if other or not known:
+                            of = q
+                            slope_u, slope_v, known = inverse_depth_slope(
+                                inverse, v, u, radius, jump
+                            )
+                        good = count > 0
+                        if not good:
+                            if known:
+                                along_z = q - slope_u * (u - K[2]) - slope_v * (v - K[3])
+                                m = ti.Vector([slope_u * K[0], slope_v * K[1], along_z]) / q
+                                # m . ray = 1
+                                good = cos_max_angle * m.norm() * ray(u, v, K).norm() <= 1.0
+                                normal = -rotate(T_world_camera, m).normalized()
+                        if good:
+                            count += 1
+                            mask |= 1 << p
+                            x += lift(u, v, 1.0 / q, K)
+            if ti.static(sinks.has_surface):
+                if run_s > 0 and block_s >= now[4]:
+                    add_run(6, block_s, place_s, run_s, total_s, sign, sums_s)
+            if ti.static(sinks.has_color):
+                if run_c > 0 and block_c >= now[5]:
+                    add_run(3, block_c, place_c, run_c, total_c, sign, sums_c)
+            if ti.static(sinks.write):
+                patches.found[part] = n - part * ti.static(slots_of_run())
+            ti.atomic_add(totals[0], n - part * ti.static(slots_of_run()))
+            ti.atomic_add(totals[1], pixels)
 
 
 @ti.kernel

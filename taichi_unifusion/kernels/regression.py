@@ -16,6 +16,7 @@ from .cells import CELLS, cell_bit, cells_before, first_cell
 from .encoding import position_features, position_gradient
 from .gram import flush, keep_sums, solve_voxel
 from .index import INDEX_HALF, block_in, in_range
+from .tasks import worker_stride
 
 TILE = 128  # samples whose features are held at once: the products run over this contiguous axis
 
@@ -59,11 +60,6 @@ def cell_row(cell: ti.i32, step: ti.template()) -> ti.i32:
     """
     cube = ti.Vector([cell >> 4, cell >> 2 & 3, cell & 3]) + CELLS * step + CELLS // 2
     return (cube[0] << 6) + (cube[1] << 3) + cube[2]
-
-
-def worker_stride() -> int:
-    """Loop iterations a worker: Taichi cuts a CPU loop into chunks of at least 512."""
-    return 512 if ti.lang.impl.current_cfg().arch in (ti.x64, ti.arm64) else 1
 
 
 @ti.func

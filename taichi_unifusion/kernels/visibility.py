@@ -12,6 +12,7 @@ from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, Votes2, row
 from .camera import Intrinsics
 from .cells import BLOCK_CELLS, CELLS, cell_center, cell_in_lattice, has_cell
 from .index import INDEX_HALF, find, voxel_of
+from .tasks import worker_stride
 
 MOST_VOTES = 127  # votes that a cell can hold, for or against
 SLACK_VOXELS = 0.5  # a reading this far behind a point passes through it [voxels]...
@@ -20,6 +21,7 @@ GRAZING = 0.1  # cosine; rays flatter on a surface than this cannot say that the
 ALONE = 0.45  # the surface of a cell lies within this distance of its centre [voxels]
 LEAST_TENT = 1e-6  # smallest sum of tent weights that counts; below it the default 1 is used
 FREE, SURFACE, NOTHING = range(3)  # what there is to ask in a cell: none was seen there yet, or is
+VOTE_TASK = 16  # voxels that one task votes in
 FLAT = 0.2  # a field with a smaller slope than this has no surface to speak of
 
 
@@ -171,48 +173,54 @@ def vote_cells(
     # (S, 64) += views that saw the cell's surface, -= those that saw through the cell
     evidence: Votes2,
 ):
-    for s in range(begin, end):
-        seen = views_of(s, keys, voxel_size, depth, K, T_camera_world)
-        if seen != 0:
-            F = ti.Vector([0.0] * rank)
-            for a in range(rank):
-                F[a] = latents[s, a, 0]
-            kinds = ti.Vector([0] * BLOCK_CELLS)
-            votes = ti.Vector([0] * BLOCK_CELLS)
-            points = ti.Vector([0.0] * (3 * BLOCK_CELLS))
-            normals = ti.Vector([0.0] * (3 * BLOCK_CELLS))
-            for cell in range(BLOCK_CELLS):  # once for all views
-                x, normal = cell_center(cell), ti.Vector([0.0, 0.0, 0.0])
-                if has_cell(masks, s, cell) != 0:
-                    x, normal, found = cell_surface(rank, F, cell, features)
-                    kinds[cell] = SURFACE if found else NOTHING
-                for d in ti.static(range(3)):
-                    points[3 * cell + d], normals[3 * cell + d] = x[d], normal[d]
-            for k in range(T_camera_world.shape[0]):
-                if (seen >> ti.cast(k, ti.u32)) & 1 != 0:
-                    R, corner = rotation_and_corner(T_camera_world, k, s, keys, voxel_size)
+    stride = ti.static(worker_stride())
+    for i in range((end - begin + VOTE_TASK - 1) // VOTE_TASK * stride):
+        if i % stride == 0:
+            first = begin + i // stride * VOTE_TASK
+            for s in range(first, ti.min(first + VOTE_TASK, end)):
+                seen = views_of(s, keys, voxel_size, depth, K, T_camera_world)
+                if seen != 0:
+                    F = ti.Vector([0.0] * rank)
+                    for a in range(rank):
+                        F[a] = latents[s, a, 0]
+                    kinds = ti.Vector([0] * BLOCK_CELLS)
+                    votes = ti.Vector([0] * BLOCK_CELLS)
+                    points = ti.Vector([0.0] * (3 * BLOCK_CELLS))
+                    normals = ti.Vector([0.0] * (3 * BLOCK_CELLS))
+                    for cell in range(BLOCK_CELLS):  # once for all views
+                        x, normal = cell_center(cell), ti.Vector([0.0, 0.0, 0.0])
+                        if has_cell(masks, s, cell) != 0:
+                            x, normal, found = cell_surface(rank, F, cell, features)
+                            kinds[cell] = SURFACE if found else NOTHING
+                        for d in ti.static(range(3)):
+                            points[3 * cell + d], normals[3 * cell + d] = x[d], normal[d]
+                    for k in range(T_camera_world.shape[0]):
+                        if (seen >> ti.cast(k, ti.u32)) & 1 != 0:
+                            R, corner = rotation_and_corner(T_camera_world, k, s, keys, voxel_size)
+                            for cell in range(BLOCK_CELLS):
+                                if kinds[cell] != NOTHING:
+                                    at = 3 * cell
+                                    x = ti.Vector([points[at], points[at + 1], points[at + 2]])
+                                    p = corner + R @ x
+                                    behind, known = read_behind(p, k, depth, K)
+                                    slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]
+                                    if known and ti.abs(behind) <= slack:  # as mostly
+                                        votes[cell] += kinds[cell]  # whatever the angle
+                                    elif kinds[cell] == FREE:
+                                        # record that this view saw through, in case a later frame
+                                        # extrapolates a surface here
+                                        votes[cell] -= ti.cast(known and behind > slack, ti.i32)
+                                    elif p[2] > 0:
+                                        n = ti.Vector(
+                                            [normals[at], normals[at + 1], normals[at + 2]]
+                                        )
+                                        normal = R @ n / voxel_size
+                                        votes[cell] += surface_vote(
+                                            p, normal, behind, known, slack, k, depth, K
+                                        )
                     for cell in range(BLOCK_CELLS):
-                        if kinds[cell] != NOTHING:
-                            at = 3 * cell
-                            x = ti.Vector([points[at], points[at + 1], points[at + 2]])
-                            p = corner + R @ x
-                            behind, known = read_behind(p, k, depth, K)
-                            slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]
-                            if known and ti.abs(behind) <= slack:  # as mostly
-                                votes[cell] += kinds[cell]  # whatever the angle
-                            elif kinds[cell] == FREE:
-                                # record that this view saw through, in case a later frame
-                                # extrapolates a surface here
-                                votes[cell] -= ti.cast(known and behind > slack, ti.i32)
-                            elif p[2] > 0:
-                                n = ti.Vector([normals[at], normals[at + 1], normals[at + 2]])
-                                normal = R @ n / voxel_size
-                                votes[cell] += surface_vote(
-                                    p, normal, behind, known, slack, k, depth, K
-                                )
-            for cell in range(BLOCK_CELLS):
-                if votes[cell] != 0:
-                    add_votes(evidence, s, cell, sign * votes[cell])
+                        if votes[cell] != 0:
+                            add_votes(evidence, s, cell, sign * votes[cell])
 
 
 @ti.kernel
