@@ -51,6 +51,14 @@ class CellArrays:
         """Make room for the keys of `rows` blocks; the first `used` are kept."""
         self.keys = _grow(self.keys, rows, used)
 
+    def grow_ahead(self, blocks: int) -> None:
+        """Make room for the next window after one of so many blocks, while nothing is summed up:
+        to grow later would take a copy, for which a frame would wait.
+        """
+        if 3 * blocks > 2 * self.room:
+            self.reserve_keys(2 * self.room, 0)
+            self.reserve(2 * self.room, 0)
+
     def reserve(self, rows: int, used: int) -> None:
         """Make room for the sums of `rows` blocks; the first `used` are kept."""
         self.sums = _grow(self.sums, rows, used)

@@ -201,6 +201,7 @@ class Window:
     def _pieces(self, part: OpenPart) -> Iterator[Piece]:
         name, encoder = " + ".join(part.part.names), part.part.encoder
         binned = part.part.binner.close(part.cells, part.arena)
+        part.cells.arrays.grow_ahead(part.cells.count)
         local = encoder.room(binned)
         step = PIECE // encoder.layout.size
         for begin in range(0, binned.count, step):
