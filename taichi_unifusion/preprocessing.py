@@ -68,24 +68,36 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
     A frame without a usable pixel gives an empty cloud.
     """
     runtime.current()
-    settings, views = settings or PreprocessSettings(), view_images(1, frame)
+    settings = settings or PreprocessSettings()
+    views = np.empty((1, *frame.depth.shape), np.float32)
     patches = find_patches(frame, settings, invert_depth(frame, settings, views, 0), np.eye(4))
     found = patches.found.to_numpy()
-    places = np.arange(len(found) * patches.slots).reshape(len(found), patches.slots)
-    rows = places[np.arange(patches.slots) < found[:, None]]
+    places = np.arange(len(found) * patches.slots, dtype=np.int32)
+    rows = places[(np.arange(patches.slots) < found[:, None]).ravel()]
     attributes = {}
     for name, each in patches.attributes.items():
-        attributes[name] = each.values.to_numpy()[rows]
+        attributes[name] = _take(each.values, rows)
         if not each.whole:  # maps leave out points whose value is not finite
-            attributes[name][each.counts.to_numpy()[rows] == 0] = np.nan
+            attributes[name][_take(each.counts, rows) == 0] = np.nan
     return PointCloud(
-        patches.points.to_numpy()[rows],
-        patches.normals.to_numpy()[rows],
+        _take(patches.points, rows),
+        _take(patches.normals, rows),
         attributes,
-        ImageView(views.to_numpy()[0], frame.camera),
+        ImageView(views[0], frame.camera),
         frame.features,
-        patches.counts.to_numpy()[rows],
+        _take(patches.counts, rows),
     )
+
+
+def _take(array: DeviceArray, rows: NDArray[np.int32]) -> NDArray:
+    """Rows of an array on the device, by value."""
+    from .kernels.pools import gather_rows
+
+    counts = len(array.shape) == 1
+    taken = np.empty((len(rows), *array.shape[1:]), np.int32 if counts else np.float32)
+    if len(rows):
+        gather_rows(rows, array, taken)
+    return taken
 
 
 def invert_depth(
@@ -189,13 +201,6 @@ def _nothing() -> Target:
         return Target(Sink(None, 0.0), 0, 0, keys, sums)
 
     return runtime.current().arena.exact("no target", make, ())
-
-
-def view_images(count: int, frame: Frame) -> DeviceArray:
-    """Room (count, H, W) on the device for depth images of the size of a frame's."""
-    import taichi as ti
-
-    return ti.ndarray(ti.f32, (count, *frame.depth.shape))
 
 
 def normal_image(frame: Frame, settings: PreprocessSettings | None = None) -> NDArray[np.float32]:

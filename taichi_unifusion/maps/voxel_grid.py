@@ -38,7 +38,7 @@ BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16
 CUDA_TREE, CUDA_CHUNK, CUDA_RESERVE = 90_000_000, 66_000_000, 330_000_000
 NODES_PER_CHUNK = 16_384
 # room to begin with: what a room needs, so that hardly any video waits, but little memory
-FIRST_CAPACITY, LEAST_CAPACITY, FIRST_BYTES = 65_536, 4096, 16 << 20
+FIRST_CAPACITY, LEAST_CAPACITY, FIRST_BYTES = 131_072, 4096, 16 << 20
 
 KEYS = VoxelField("keys", np.dtype(np.int32), (3,))
 WEIGHTS = VoxelField("weights", np.dtype(np.float32))
