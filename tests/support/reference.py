@@ -168,6 +168,11 @@ def touch_points(x):
     return set(rows_by(np.floor(x).astype(int)))
 
 
+def frames_in(x, frames):
+    """Voxel -> the frames, by number, that have a point in it."""
+    return {key: set(frames[n].tolist()) for key, n in rows_by(np.floor(x).astype(int)).items()}
+
+
 def block_of_points(x):
     """Voxel of each point."""
     return np.floor(x).astype(int)
@@ -179,17 +184,25 @@ def cell_number(cell):
     return (i * CELLS + j) * CELLS + k
 
 
-def bin_points(x, values):
-    """Lattice cell -> (count, mean value, mean position)."""
+def bin_points(x, values, counts=None):
+    """Lattice cell -> (count, mean value, mean position) of points that stand for `counts` pixels
+    each, or for one.
+    """
+    counts = np.ones(len(x), int) if counts is None else counts
     return {
-        cell: (len(n), values[n].mean(axis=0), x[n].mean(axis=0))
+        cell: (
+            counts[n].sum(),
+            np.average(values[n], axis=0, weights=counts[n]),
+            np.average(x[n], axis=0, weights=counts[n]),
+        )
         for cell, n in rows_by(np.floor(x * CELLS).astype(int)).items()
+        if counts[n].any()
     }
 
 
-def surfels(x, normals):
+def surfels(x, normals, counts=None):
     """(count, mean point, unit mean normal) for every cell whose normals do not cancel."""
-    for count, normal, point in bin_points(x, normals).values():
+    for count, normal, point in bin_points(x, normals, counts).values():
         if np.linalg.norm(normal) > 0.1:
             yield count, point, normal / np.linalg.norm(normal)
 
@@ -200,12 +213,24 @@ def touch_surfel_samples(x, normals, offsets):
     return touch_points(x) | touch_points(np.array(beside))
 
 
-def bin_surfel_samples(x, normals, offsets):
+def surfel_sample_frames(x, normals, offsets, frames):
+    """Voxel -> the frames that have a point in it, or in a voxel whose surfels sample it; of voxels
+    with samples.
+    """
+    seen, found = frames_in(x, frames), defaultdict(set)
+    for _, point, normal in surfels(x, normals):
+        own = tuple(np.floor(point).astype(int).tolist())
+        for a in offsets:
+            found[tuple(np.floor(point + a * normal).astype(int).tolist())] |= seen[own]
+    return dict(found)
+
+
+def bin_surfel_samples(x, normals, offsets, counts=None):
     """Lattice cell -> (count, mean signed distance of its centre to the planes of the surfels that
     sample it, mean normal).
     """
     sums = defaultdict(lambda: np.zeros(5))
-    for count, point, normal in surfels(x, normals):
+    for count, point, normal in surfels(x, normals, counts):
         for a in offsets:
             cell = np.floor((point + a * normal) * CELLS).astype(int)
             distance = normal @ ((cell + 0.5) / CELLS - point)
@@ -282,9 +307,13 @@ def encode_cells(
     margin,
     centered=False,
     encode=encode_voxel,
+    frames=None,
 ):
     """The same from cell averages (count, mean targets, mean normals), which lie at the cell
     centres.
+
+    `frames`: voxel -> the frames that saw it. Noise is a frame's: as many frames as saw any voxel
+    whose cells count add as much of it.
     """
     lattice = np.array(list(cells))
     counts = np.array([cell[0] for cell in cells.values()], float)
@@ -295,6 +324,8 @@ def encode_cells(
             offset = lattice - CELLS * np.array(key)
             near = ((offset >= -margin) & (offset < CELLS + margin)).all(axis=1)
             t = ((offset[near] + 0.5) / CELLS - 0.5) / 2
+            beside = map(tuple, (lattice[near] // CELLS).tolist())
+            seen = set().union(*(frames[voxel] for voxel in beside)) if frames else {0}
             local[key] = (
                 encode(
                     encoder,
@@ -302,7 +333,7 @@ def encode_cells(
                     counts[near],
                     targets[near],
                     normals[near] if derivatives else None,
-                    noise,
+                    noise * len(seen),
                     centered,
                 ),
                 counts[near].sum(),
@@ -310,13 +341,17 @@ def encode_cells(
     return local
 
 
-def surface_frame(encoder, x, normals, settings, encode=encode_voxel):
-    """Local surface LIM of a frame: sample-based (Sec. IV-B.2) or derivative-based (IV-B.1) GPIS."""
+def surface_frame(encoder, x, normals, settings, encode=encode_voxel, frames=None):
+    """Local surface LIM of a frame: sample-based (Sec. IV-B.2) or derivative-based (IV-B.1) GPIS;
+    or of a window, where `frames` are the numbers of the points' frames.
+    """
     derivatives = settings.gpis == "derivatives"
     steps = [0.0] if derivatives else [-settings.sample_distance, 0.0, settings.sample_distance]
     options = {"noise": settings.noise, "minimum": settings.min_points, "encode": encode}
     if settings.sampling == "cells":
         cells = bin_surfel_samples(x, normals, steps)
+        if frames is not None:
+            options["frames"] = surfel_sample_frames(x, normals, steps, frames)
         local = encode_cells(
             encoder, cells, derivatives=derivatives, margin=settings.margin, **options
         )
@@ -333,8 +368,8 @@ def surface_frame(encoder, x, normals, settings, encode=encode_voxel):
     return {key: Voxel(F, w, masks[key]) for key, (F, w) in local.items()}
 
 
-def property_frame(encoder, x, values, settings, encode=encode_voxel):
-    """Local property LIM of a frame (Eq. 18)."""
+def property_frame(encoder, x, values, settings, encode=encode_voxel, frames=None):
+    """Local property LIM of a frame (Eq. 18), or of a window as in `surface_frame`."""
     options = {
         "noise": settings.noise,
         "minimum": settings.min_points,
@@ -343,7 +378,8 @@ def property_frame(encoder, x, values, settings, encode=encode_voxel):
     }
     cells = bin_points(x, values)
     if settings.sampling == "cells":
-        local = encode_cells(encoder, cells, margin=settings.margin, **options)
+        seen = None if frames is None else frames_in(x, frames)
+        local = encode_cells(encoder, cells, margin=settings.margin, frames=seen, **options)
     else:
         local = encode_points(encoder, x, values, **options)
     masks = mark_cells({cell: value[0] for cell, value in cells.items()}, 1)
@@ -575,24 +611,38 @@ def drop_flying_pixels(depth, jump, support):
 
 
 def inverse_depth_slope(inverse, v, u, radius, jump):
-    """Slopes of 1/z by u and v, least squares over opposite pairs of pixels that both belong with
-    the centre; squares found.
+    """Slopes of 1/z by u and v, least squares over the pairs of pixels on opposite edges of the
+    window that both belong with the centre; the smaller number of pairs.
     """
     height, width = inverse.shape
-    sums = np.zeros((2, 2))
+    slopes, pairs = np.zeros(2), np.zeros(2, int)
     q = inverse[v, u]
     if radius <= v < height - radius and radius <= u < width - radius:
-        for i, k in product(range(-radius, radius + 1), range(1, radius + 1)):
+        for i in range(-radius, radius + 1):
             for axis, (ahead, behind) in enumerate(
                 (
-                    (inverse[v + i, u + k], inverse[v + i, u - k]),
-                    (inverse[v + k, u + i], inverse[v - k, u + i]),
+                    (inverse[v + i, u + radius], inverse[v + i, u - radius]),
+                    (inverse[v + radius, u + i], inverse[v - radius, u + i]),
                 )
             ):
                 if max(abs(ahead - q), abs(behind - q)) < jump * q:
-                    sums[axis] += k * (ahead - behind), 2 * k * k
-    slopes = sums[:, 0] / np.maximum(sums[:, 1], 1)
-    return slopes[0], slopes[1], sums[:, 1].min()
+                    slopes[axis] += (ahead - behind) / (2 * radius)
+                    pairs[axis] += 1
+    slopes /= np.maximum(pairs, 1)
+    return slopes[0], slopes[1], pairs.min()
+
+
+def normal_towards_camera(q, slopes, v, u, fx, fy, cx, cy, cos_max_angle):
+    """Normal of the plane 1/z = a u + b v + c, which is q at (v, u); None where it is seen at too
+    grazing an angle.
+    """
+    ray = np.array([(u - cx) / fx, (v - cy) / fy, 1])
+    # plane . x = 1
+    plane = np.array(
+        [slopes[0] * fx, slopes[1] * fy, q - slopes[0] * (u - cx) - slopes[1] * (v - cy)]
+    )
+    plane /= np.linalg.norm(plane)
+    return -plane if plane @ ray / np.linalg.norm(ray) >= cos_max_angle else None
 
 
 def estimate_normals(inverse, fx, fy, cx, cy, radius, jump, cos_max_angle):
@@ -610,39 +660,13 @@ def estimate_normals(inverse, fx, fy, cx, cy, radius, jump, cos_max_angle):
             if found == 0 or abs(q - fitted_at) > 0.5 * jump * q:
                 slope_u, slope_v, found = inverse_depth_slope(inverse, v, u, radius, jump)
                 fitted_at = q
-            if found >= 2 * radius**2:
-                ray = np.array([(u - cx) / fx, (v - cy) / fy, 1])
-                # plane . x = 1
-                plane = np.array(
-                    [slope_u * fx, slope_v * fy, q - slope_u * (u - cx) - slope_v * (v - cy)]
+            if found > 0:
+                normal = normal_towards_camera(
+                    q, (slope_u, slope_v), v, u, fx, fy, cx, cy, cos_max_angle
                 )
-                plane /= np.linalg.norm(plane)
-                if plane @ ray / np.linalg.norm(ray) >= cos_max_angle:
-                    normals[v, u] = -plane
+                if normal is not None:
+                    normals[v, u] = normal
     return normals
-
-
-def count_points(normals):
-    return np.count_nonzero(normals[..., 2])
-
-
-def unproject(depth, normals, fx, fy, cx, cy):
-    """Points, their normals and pixels, row by row."""
-    v, u = np.nonzero(normals[..., 2])
-    z = depth[v, u].astype(float)
-    return (
-        np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1),
-        normals[v, u],
-        np.stack([v, u], axis=1),
-    )
-
-
-def sample_color(pixels, color):
-    return color[pixels[:, 0], pixels[:, 1]] / 255
-
-
-def sample_image(pixels, image):
-    return image[pixels[:, 0], pixels[:, 1]]
 
 
 def transform(points, T):
