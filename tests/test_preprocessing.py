@@ -4,6 +4,8 @@ point.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import reference
@@ -21,6 +23,7 @@ UNIT = 1e-6  # float32 of numbers about 1
 DEGREE = 1.0
 NORMAL = 1e-3  # float32 slopes of the inverse depth, differences of numbers 1 % apart
 INTRINSICS = CAMERA.intrinsics
+PIXELS = PreprocessSettings(patch_size=0.0)  # every pixel is a point
 
 
 def plane_frame(normal, distance: float = 2.0, camera: PinholeCamera = CAMERA, **values) -> Frame:
@@ -105,29 +108,6 @@ def test_estimate_normals_equals_its_twin(radius, max_angle):
     np.testing.assert_allclose(normals, twin, atol=NORMAL)
 
 
-def test_count_unproject_and_sample_equal_their_twins():
-    rng, frame = np.random.default_rng(2), step_frame()
-    normals = rng.normal(size=(48, 64, 3)).astype(np.float32)
-    normals[rng.uniform(size=(48, 64)) < 0.4, 2] = 0
-    counts = np.empty(48 * 64 // kernels.PIXEL_CHUNK, np.int32)
-    kernels.count_points(normals, counts)
-    total = reference.count_points(normals)
-    assert counts.sum() == total
-    points, point_normals = np.empty((total, 3), np.float32), np.empty((total, 3), np.float32)
-    pixels, starts = np.empty((total, 2), np.int32), (np.cumsum(counts) - counts).astype(np.int32)
-    kernels.unproject(frame.depth, normals, INTRINSICS, starts, points, point_normals, pixels)
-    twin_points, twin_normals, twin_pixels = reference.unproject(frame.depth, normals, *INTRINSICS)
-    np.testing.assert_allclose(points, twin_points, rtol=UNIT, atol=UNIT)
-    np.testing.assert_array_equal(point_normals, twin_normals)
-    np.testing.assert_array_equal(pixels, twin_pixels)
-    image = rng.normal(size=(48, 64, 5)).astype(np.float32)
-    colors, values = np.empty((total, 3), np.float32), np.empty((total, 5), np.float32)
-    kernels.sample_color(pixels, frame.color, colors)
-    kernels.sample_image(pixels, image, values)
-    np.testing.assert_allclose(colors, reference.sample_color(pixels, frame.color), rtol=UNIT)
-    np.testing.assert_array_equal(values, reference.sample_image(pixels, image))
-
-
 def test_transform_equals_its_twin():
     rng, T = np.random.default_rng(3), np.eye(4)
     T[:3, :3], T[:3, 3] = np.linalg.qr(rng.normal(size=(3, 3)))[0], (1, -2, 3)
@@ -157,7 +137,7 @@ def test_normals_of_planes_are_right_and_point_to_the_camera(degrees, about):
     normal = tilted(degrees, about)
     frame = plane_frame(normal, camera=FINE)
     cloud = preprocess(frame)
-    assert len(cloud) > 0.75 * frame.depth.size
+    assert cloud.counts.sum() > 0.75 * frame.depth.size
     angle = np.degrees(np.arccos(np.clip(cloud.normals.astype(float) @ normal, -1, 1)))
     assert angle.max() < DEGREE
     assert (np.einsum("ni,ni->n", cloud.normals, cloud.points) < 0).all()
@@ -166,29 +146,69 @@ def test_normals_of_planes_are_right_and_point_to_the_camera(degrees, about):
     np.testing.assert_allclose(cloud.points @ normal, 2 * normal[2], atol=2e-5)
 
 
-def test_points_come_row_by_row_from_pixels_with_their_colour_and_images():
+def placed_frame() -> Frame:
+    """A slanted plane whose pixels carry their row and column, colour and seven more values."""
     rng, frame = np.random.default_rng(4), plane_frame(tilted(30))
-    v, u = np.mgrid[:48, :64]
-    place = (v * 64 + u).astype(np.float32)
     color = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
-    frame = (
+    place = np.moveaxis(np.mgrid[:48, :64], 0, -1).astype(np.float32)
+    return (
         Frame(frame.depth, CAMERA, color)
         .with_image("place", place)
         .with_image("deep", rng.normal(size=(48, 64, 7)))
     )
-    cloud = preprocess(frame)
-    pixel = cloud.attributes["place"][:, 0].astype(int)
-    assert (np.diff(pixel) > 0).all() and set(cloud.attributes) == {"color", "place", "deep"}
+
+
+def test_points_come_quad_by_quad_from_pixels_with_their_colour_and_images():
+    frame = placed_frame()
+    cloud = preprocess(frame, PIXELS)
+    v, u = cloud.attributes["place"].astype(int).T
+    order = np.lexsort((u % 2, v % 2, u // 2, v // 2))
+    assert (np.diff(order) == 1).all() and len(np.unique(v * 64 + u)) == len(cloud) > 2000
+    assert set(cloud.attributes) == {"color", "place", "deep"} and (cloud.counts == 1).all()
     seen = cloud.points.astype(float) / cloud.points[:, 2:]
-    np.testing.assert_allclose(seen[:, 0] * CAMERA.fx + CAMERA.cx, pixel % 64, atol=1e-4)
-    np.testing.assert_allclose(seen[:, 1] * CAMERA.fy + CAMERA.cy, pixel // 64, atol=1e-4)
-    np.testing.assert_array_equal(cloud.points[:, 2], frame.depth.reshape(-1)[pixel])
-    np.testing.assert_allclose(
-        cloud.attributes["color"], color.reshape(-1, 3)[pixel] / 255, atol=UNIT
+    np.testing.assert_allclose(seen[:, 0] * CAMERA.fx + CAMERA.cx, u, atol=1e-4)
+    np.testing.assert_allclose(seen[:, 1] * CAMERA.fy + CAMERA.cy, v, atol=1e-4)
+    np.testing.assert_allclose(cloud.points[:, 2], frame.depth[v, u], rtol=3e-7)  # 1 / (1 / z)
+    np.testing.assert_allclose(cloud.attributes["color"], frame.color[v, u] / 255, atol=UNIT)
+    np.testing.assert_array_equal(cloud.attributes["deep"], frame.images["deep"][v, u])
+
+
+def test_a_patch_is_the_mean_of_its_pixels_and_counts_them():
+    frame = placed_frame()
+    pixels, cloud = (
+        preprocess(frame, settings) for settings in (PIXELS, PreprocessSettings(patch_size=1.0))
     )
-    np.testing.assert_array_equal(
-        cloud.attributes["deep"], frame.images["deep"].reshape(-1, 7)[pixel]
-    )
+    assert cloud.counts.sum() == len(pixels) and (cloud.counts == 4).mean() > 0.7
+    quad = np.floor(cloud.attributes["place"] / 2)
+    whole = np.flatnonzero(cloud.counts == 4)
+    for n in whole[::37]:
+        own = (np.floor(pixels.attributes["place"] / 2) == quad[n]).all(axis=1)
+        assert own.sum() == 4
+        np.testing.assert_allclose(cloud.points[n], pixels.points[own].mean(axis=0), atol=3 * UNIT)
+        for name, values in cloud.attributes.items():
+            wanted = pixels.attributes[name][own].mean(axis=0)
+            np.testing.assert_allclose(values[n], wanted, rtol=UNIT, atol=UNIT)
+
+
+def test_patches_are_no_larger_than_they_may_be():
+    """Two pixels span their depth over the focal length: near ones are put together, far ones not."""
+    frame, size = plane_frame(tilted(60), camera=FINE), 0.0095
+    cloud = preprocess(frame, PreprocessSettings(patch_size=size))
+    spans = 2 * cloud.points[:, 2] / FINE.fx
+    assert (cloud.counts[spans > 1.01 * size] == 1).all()
+    assert (cloud.counts[spans < 0.99 * size] == 4).mean() > 0.9
+    assert 0.2 < (cloud.counts == 1).mean() < 0.9
+
+
+def test_values_that_are_no_numbers_leave_their_pixels_out_of_a_patch():
+    frame = plane_frame(tilted(30)).with_image("x", np.ones((48, 64)))
+    frame.images["x"][::2, ::2], frame.images["x"][:, 40:] = np.nan, np.inf
+    whole = Frame(frame.depth, CAMERA)
+    cloud, plain = (preprocess(f, PreprocessSettings(patch_size=1.0)) for f in (frame, whole))
+    np.testing.assert_array_equal(cloud.points, plain.points)  # points do not depend on it
+    u = cloud.points[:, 0] / cloud.points[:, 2] * CAMERA.fx + CAMERA.cx
+    values = cloud.attributes["x"][:, 0]
+    assert np.isnan(values[u > 40]).all() and (values[(u < 39) & (cloud.counts == 4)] == 1).all()
 
 
 def test_an_image_named_color_replaces_the_colour():
@@ -239,8 +259,6 @@ def test_F4_one_valid_pixel_gives_no_point(at):
     depth = np.zeros((48, 64), np.float32)
     depth[at] = 1
     assert len(preprocess(Frame(depth, CAMERA))) == 0
-    # no neighbours, no normal
-    assert len(preprocess(Frame(depth, CAMERA), PreprocessSettings(edge_support=0))) == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (7, 7), (65, 1)])
@@ -269,18 +287,15 @@ def test_flying_pixels_are_dropped_and_a_slanted_plane_survives():
     z = cloud.points[:, 2]
     assert ((z == 1) | (z == 3)).all() and (z == 1).sum() > 800 and (z == 3).sum() > 1000
     assert (cloud.normals[:, 2] < -0.999).all()  # also beside the edge
-    kept = preprocess(Frame(depth, CAMERA), PreprocessSettings(edge_support=2))
-    # without a window on its own surface it has no normal
-    assert (kept.points[:, 2] == 2).sum() == 0
     slanted = plane_frame(tilted(65, 20), camera=FINE)
-    assert len(preprocess(slanted)) > 0.75 * slanted.depth.size
+    assert preprocess(slanted).counts.sum() > 0.75 * slanted.depth.size
 
 
 @pytest.mark.parametrize("limit", [41.5, 48])
 def test_grazing_pixels_are_left_out(limit):
     frame = plane_frame(tilted(45), camera=FINE)
-    cloud = preprocess(frame, PreprocessSettings(max_angle=limit))
-    everything = preprocess(frame, PreprocessSettings(max_angle=90))
+    cloud = preprocess(frame, replace(PIXELS, max_angle=limit))
+    everything = preprocess(frame, replace(PIXELS, max_angle=90))
 
     def angles(c):
         return np.degrees(
@@ -310,7 +325,6 @@ def test_strided_images_are_read_as_they_are():
         {"depth_min": 0.0},
         {"depth_min": 3.0, "depth_max": 2.0},
         {"edge_jump": 0.0},
-        {"edge_support": 9},
         {"normal_radius": 0},
         {"max_angle": 0.0},
         {"max_angle": 91.0},
@@ -321,8 +335,14 @@ def test_settings_that_make_no_sense_are_refused(wrong):
         PreprocessSettings(**wrong)
 
 
+@pytest.mark.parametrize("wrong", [-0.01, float("inf"), float("nan")])
+def test_a_patch_size_that_is_no_length_is_refused(wrong):
+    with pytest.raises(InputError, match="preprocess: patch_size must be a number from 0"):
+        PreprocessSettings(patch_size=wrong)
+
+
 def test_F3_a_real_frame_has_no_point_where_the_sensor_read_nothing(data):
     frame = open_dataset("7scenes", data("7scenes-redkitchen"))[0]
     cloud = preprocess(frame)
-    assert 150_000 < len(cloud) < 290_000 and cloud.points[:, 2].max() <= 5.0
+    assert 150_000 < cloud.counts.sum() < 290_000 and cloud.points[:, 2].max() <= 5.0
     assert (np.einsum("ni,ni->n", cloud.normals, cloud.points) < 0).all()
