@@ -1,26 +1,28 @@
-"""Per-frame binning: the kernels against their twins, and the index range."""
+"""Binning of a frame, and of several: the kernels against their twins, and the index range."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import reference
-from scenes import rough, taken
+from scenes import cloud_of, moved, rough, taken
 
+from taichi_unifusion import PointCloud
 from taichi_unifusion.errors import OutOfRange
 from taichi_unifusion.kernels import binning
-from taichi_unifusion.kernels.index import block_of_points, touch_points
+from taichi_unifusion.kernels.index import block_of_points, forget_blocks, touch_points
+from taichi_unifusion.kernels.patches import Patches, Values
 from taichi_unifusion.kernels.regression import find_neighbors
-from taichi_unifusion.maps.binner import FIRST_BLOCKS, Binner, SurfelBinner
+from taichi_unifusion.maps.binner import FIRST_BLOCKS, Binner, SurfelBinner, patches_of
 from taichi_unifusion.maps.voxel_grid import MASKS, WEIGHTS, VoxelGrid, latents
 
 VS = 0.05
 FIXED = 1e-6  # 24 fractional bits, rounded once a run of points, and float32 sums within a run
 POSITION = 5e-6  # [voxels] float32 positions some voxels from the origin
 OFFSETS = np.array([-0.1, 0.0, 0.2], np.float32)  # not symmetric, so that a wrong sign shows
-ROOM = 4000
+ROOM, SLOTS = 4000, 32
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +43,32 @@ def in_voxels(points) -> np.ndarray:
     return (points * np.float32(1 / VS)).astype(float)
 
 
+def in_runs(cloud: PointCloud, slots: int = SLOTS):
+    """`found` (R,), points, counts and normals in runs of `slots` places: as many in each as it
+    happens, and rubbish in the places behind them.
+    """
+    rng, n = np.random.default_rng(9), 0
+    found = []
+    while n < len(cloud):
+        found.append(min(int(rng.integers(0, slots + 1)), len(cloud) - n))
+        n += found[-1]
+    filled = (np.arange(slots) < np.array(found)[:, None]).ravel()
+    points, normals = np.full((2, len(filled), 3), np.nan, np.float32)
+    counts = np.full(len(filled), 77, np.int32)
+    points[filled], normals[filled], counts[filled] = cloud.points, cloud.normals, counts_of(cloud)
+    return np.array(found, np.int32), points, counts, normals
+
+
+def counts_of(cloud: PointCloud) -> np.ndarray:
+    return np.ones(len(cloud), np.int32) if cloud.counts is None else cloud.counts
+
+
 @dataclass
 class Blocks:
-    """The voxels that a frame touches, and sums in their cells, through the kernels alone."""
+    """The voxels that clouds touch, and sums in their cells, through the kernels alone."""
 
     grid: VoxelGrid
-    frame: int
+    stamp: int
     keys: np.ndarray  # (ROOM, 3)
     counters: np.ndarray
 
@@ -59,29 +81,42 @@ class Blocks:
         """Voxel of each block."""
         return list(map(tuple, self.keys[: self.count].tolist()))
 
-    def bin(self, points, values, with_positions):
-        """Counts (ROOM, 64) and sums (ROOM, 64, c)."""
-        width = values.shape[1] + 3 * with_positions
-        counts, sums = np.zeros((ROOM, 64), np.int32), np.zeros((ROOM, 64, width), np.int64)
-        nothing, channels = [points] * 3, (values.shape[1], 0, 0, 0)
-        index = self.grid.index
-        binning.bin_points(
-            points, values, *nothing, channels, 1 / VS, 32, with_positions, index, counts, sums
-        )
-        return counts, sums
+    def touch(self, cloud: PointCloud) -> None:
+        found, points, counts, _ = in_runs(cloud)
+        touch_points(
+            found, SLOTS, points, counts, 1 / VS, self.stamp, False, self.grid.index, self.counters,
+            self.keys,
+        )  # fmt: skip
+
+    def bin(self, *clouds: PointCloud, with_positions: bool = True):
+        """Sums (ROOM, 64, 1 + 3 [+ 3]), counts first, and frames (ROOM,) as bits, of clouds one
+        after the other.
+        """
+        sums = np.zeros((ROOM, 64, 7 if with_positions else 4), np.int64)
+        frames = np.zeros(ROOM, np.uint32)
+        for n, cloud in enumerate(clouds):
+            found, points, counts, normals = in_runs(cloud)
+            nothing, channels, index = [points] * 2, (3, 0, 0), self.grid.index
+            binning.bin_points(
+                found, SLOTS, points, counts, normals, *nothing, channels, 1 / VS, 1 << n,
+                with_positions, index, sums, frames,
+            )  # fmt: skip
+        return sums, frames
 
 
-def touch(grid: VoxelGrid, points) -> Blocks:
-    keys, counters = np.zeros((ROOM, 3), np.int32), np.zeros(2, np.int32)
-    frame = grid.next_frame()
-    touch_points(points, 1 / VS, frame, 32, False, grid.index, counters, keys)
-    return Blocks(grid, frame, keys, counters)
+def touch(grid: VoxelGrid, *clouds: PointCloud) -> Blocks:
+    blocks = Blocks(
+        grid, grid.next_frame(), np.zeros((ROOM, 3), np.int32), np.zeros(2, np.int32)
+    )
+    for cloud in clouds:
+        blocks.touch(cloud)
+    return blocks
 
 
-def by_cell(voxels: list[tuple], counts, sums) -> dict:
+def by_cell(voxels: list[tuple], sums) -> dict:
     """Lattice cell -> (count, mean sums)."""
-    sums = sums / binning.FIXED
-    occupied = np.argwhere(counts[: len(voxels)])
+    counts, sums = sums[: len(voxels), :, 0], sums[..., 1:] / binning.FIXED
+    occupied = np.argwhere(counts)
     lattice = 4 * np.array(voxels)[occupied[:, 0]] + np.stack(
         np.unravel_index(occupied[:, 1], (4, 4, 4)), axis=1
     )
@@ -91,27 +126,69 @@ def by_cell(voxels: list[tuple], counts, sums) -> dict:
     }
 
 
+def bits_of(frames: set[int]) -> int:
+    return sum(1 << n for n in frames)
+
+
+def side_by_side(*clouds: PointCloud):
+    """Positions [voxels], normals, counts and frame numbers of the points of several clouds."""
+    return (
+        in_voxels(np.vstack([cloud.points for cloud in clouds])),
+        np.vstack([cloud.normals for cloud in clouds]).astype(float),
+        np.concatenate([counts_of(cloud) for cloud in clouds]),
+        np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds]),
+    )
+
+
 def test_touch_points_equals_its_twin(grid, cloud):
-    for part in (cloud, taken(cloud, slice(5))):  # a second frame gives numbers anew
-        blocks = touch(grid, part.points)
+    """Points that stand for no pixel touch nothing; what a frame before touched keeps its number."""
+    for part in (cloud, taken(cloud, slice(5))):  # a second stamp gives numbers anew
+        blocks = touch(grid, part)
         voxels = blocks.voxels
-        assert len(set(voxels)) == len(voxels)
+        assert len(set(voxels)) == len(voxels) and blocks.counters[1] == 0
         assert set(voxels) == reference.touch_points(in_voxels(part.points))
     assert min(min(key) for key in voxels) < 0
+    some = replace(cloud, counts=np.arange(len(cloud), dtype=np.int32) % 3)
+    blocks = touch(grid, some)
+    first = blocks.voxels
+    assert set(first) == reference.touch_points(in_voxels(cloud.points[some.counts > 0]))
+    blocks.touch(moved(cloud, (0.1, 0, 0)))
+    assert blocks.voxels[: len(first)] == first and blocks.count > len(first)
+
+
+def test_points_outside_are_counted_unless_they_stand_for_no_pixel(grid, cloud):
+    cloud = replace(cloud, points=cloud.points.copy(), counts=counts_of(cloud))
+    cloud.points[:3], cloud.counts[2] = np.nan, 0
+    assert touch(grid, cloud).counters[1] == 2
+
+
+def test_what_was_touched_in_vain_is_forgotten(grid, cloud):
+    """Then it is touched anew under the same stamp, with the numbers that follow."""
+    some, more = taken(cloud, slice(600)), moved(cloud, (0.3, 0.1, 0))
+    blocks = touch(grid, some, more)
+    known, all_of_them = touch(grid, some).count, blocks.voxels
+    blocks = touch(grid, some, more)
+    forget_blocks(known, blocks.count, blocks.keys, grid.index)
+    found = np.empty((known, 27), np.int32)
+    find_neighbors(grid.index, blocks.stamp, known, blocks.keys, found)
+    np.testing.assert_array_equal(found, reference.find_neighbors(blocks.voxels[:known]))
+    blocks.counters[0] = known
+    blocks.touch(more)
+    assert set(blocks.voxels) == set(all_of_them) and len(all_of_them) == blocks.count > known
 
 
 def test_find_neighbors_equals_its_twin(grid, cloud):
-    touch(grid, cloud.points)
-    blocks = touch(grid, taken(cloud, slice(400)).points)  # those of the frame before do not count
+    touch(grid, cloud)
+    blocks = touch(grid, taken(cloud, slice(400)))  # those of the stamp before do not count
     found = np.empty((blocks.count, 27), np.int32)
-    find_neighbors(grid.index, blocks.frame, blocks.count, blocks.keys, found)
+    find_neighbors(grid.index, blocks.stamp, blocks.count, blocks.keys, found)
     twin = reference.find_neighbors(blocks.voxels)
     np.testing.assert_array_equal(found, twin)
     assert 0.2 < (twin >= 0).mean() < 0.8 and (twin[:, 13] == np.arange(blocks.count)).all()
 
 
 def test_block_of_points_equals_its_twin(grid, cloud):
-    blocks = touch(grid, cloud.points)
+    blocks = touch(grid, cloud)
     found = np.empty(len(cloud), np.int32)
     block_of_points(cloud.points, 1 / VS, grid.index, found)
     np.testing.assert_array_equal(
@@ -120,114 +197,148 @@ def test_block_of_points_equals_its_twin(grid, cloud):
 
 
 def test_bin_points_equals_its_twin(grid, cloud):
-    blocks = touch(grid, cloud.points)
-    binned = by_cell(blocks.voxels, *blocks.bin(cloud.points, cloud.normals, True))
-    twin = reference.bin_points(in_voxels(cloud.points), cloud.normals.astype(float))
-    assert binned.keys() == twin.keys() and max(count for count, _, _ in twin.values()) > 3
+    """Two frames, whose points stand for 0 to 4 pixels."""
+    clouds = [
+        replace(each, counts=np.random.default_rng(n).integers(0, 5, len(each), dtype=np.int32))
+        for n, each in enumerate((cloud, moved(taken(cloud, slice(500)), (0.07, 0, 0))))
+    ]
+    blocks = touch(grid, *clouds)
+    sums, frames = blocks.bin(*clouds)
+    x, normals, counts, frame_of = side_by_side(*clouds)
+    binned, twin = by_cell(blocks.voxels, sums), reference.bin_points(x, normals, counts)
+    assert binned.keys() == twin.keys() and max(count for count, _, _ in twin.values()) > 9
     for cell, (count, normal, position) in twin.items():
         assert binned[cell][0] == count
         np.testing.assert_allclose(binned[cell][1][:3], normal, atol=FIXED)
         np.testing.assert_allclose(
             binned[cell][1][3:], position - (np.array(cell) + 0.5) / 4, atol=POSITION
         )
+    seen = reference.frames_in(x[counts > 0], frame_of[counts > 0])
+    wanted = [bits_of(seen[key]) for key in blocks.voxels]
+    assert frames[: blocks.count].tolist() == wanted and set(wanted) == {1, 2, 3}
 
 
 def test_the_order_of_points_does_not_change_the_sums(grid, cloud):
     order, sums = np.random.default_rng(1).permutation(len(cloud)), []
     for rows in (slice(None), order):
-        points, normals = cloud.points[rows], cloud.normals[rows]
-        blocks = touch(grid, points)
-        sums.append(by_cell(blocks.voxels, *blocks.bin(points, normals, True)))
+        blocks = touch(grid, taken(cloud, rows))
+        sums.append(by_cell(blocks.voxels, blocks.bin(taken(cloud, rows))[0]))
     assert sums[0].keys() == sums[1].keys()
     for cell, (count, mean) in sums[0].items():
         assert count == sums[1][cell][0]
         np.testing.assert_allclose(mean, sums[1][cell][1], atol=FIXED)
 
 
-def surfel_samples(grid: VoxelGrid, points, normals):
-    """Blocks of the points and of their samples, the surfels' sums, and those of the samples."""
-    blocks = touch(grid, points)
-    surfels = blocks.bin(points, normals, True)
+def surfel_samples(grid: VoxelGrid, *clouds: PointCloud):
+    """Blocks of the points and of their samples, the surfels' sums, those of the samples, and the
+    frames (ROOM,) that gave samples.
+    """
+    blocks = touch(grid, *clouds)
+    sums, frames = blocks.bin(*clouds)
     with_points = blocks.count
     binning.touch_surfel_samples(
-        with_points, *surfels, OFFSETS, blocks.frame, grid.index, blocks.keys, blocks.counters
+        with_points, sums, OFFSETS, blocks.stamp, grid.index, blocks.keys, blocks.counters
     )
-    samples = np.zeros((ROOM, 64), np.int32), np.zeros((ROOM, 64, 4), np.int64)
+    samples, sample_frames = np.zeros((ROOM, 64, 5), np.int64), np.zeros(ROOM, np.uint32)
     binning.bin_surfel_samples(
-        with_points, blocks.keys, OFFSETS, True, grid.index, *surfels, *samples
+        with_points, blocks.keys, frames, OFFSETS, True, grid.index, sums, samples, sample_frames
     )
-    return with_points, blocks, surfels, samples
+    return with_points, blocks, sums, samples, sample_frames
 
 
 def test_surfel_kernels_equal_their_twins(grid, cloud):
-    with_points, blocks, surfels, samples = surfel_samples(grid, cloud.points, cloud.normals)
-    x, normals, offsets = (a.astype(float) for a in (cloud.points, cloud.normals, OFFSETS))
-    x, voxels = in_voxels(cloud.points), blocks.voxels
+    clouds = cloud, moved(taken(cloud, slice(300)), (0.07, 0, 0))
+    with_points, blocks, surfels, samples, frames = surfel_samples(grid, *clouds)
+    x, normals, counts, frame_of = side_by_side(*clouds)
+    offsets, voxels = OFFSETS.astype(float), blocks.voxels
     assert len(set(voxels)) == len(voxels)
     assert set(voxels) == reference.touch_surfel_samples(x, normals, offsets)
     assert len(voxels) > with_points  # samples reach voxels without points
-    binned, twin = by_cell(voxels, *samples), reference.bin_surfel_samples(x, normals, offsets)
+    binned = by_cell(voxels, samples)
+    twin = reference.bin_surfel_samples(x, normals, offsets, counts)
     assert binned.keys() == twin.keys()
     for cell, (count, distance, normal) in twin.items():
         assert binned[cell][0] == count
         np.testing.assert_allclose(binned[cell][1], [*distance, *normal], atol=POSITION)
-    assert not surfels[0].any() and not surfels[1].any()  # read last, left zero
+    assert not surfels.any()  # read last, left zero
+    seen = reference.surfel_sample_frames(x, normals, offsets, frame_of)
+    wanted = [bits_of(seen.get(key, set())) for key in voxels]
+    assert frames[: len(voxels)].tolist() == wanted and {1, 2, 3} <= set(wanted)
 
 
 def test_normals_that_cancel_give_no_samples(grid):
-    points = np.full((2, 3), 0.006, np.float32)
-    normals = np.array([[0, 0, 1], [0, 0, -1]], np.float32)
-    *_, surfels, samples = surfel_samples(grid, points, normals)
-    assert not samples[0].any() and not surfels[0].any()
+    cloud = cloud_of(np.full((2, 3), 0.006), [[0, 0, 1], [0, 0, -1]])
+    _, _, surfels, samples, frames = surfel_samples(grid, cloud)
+    assert not samples.any() and not surfels.any() and not frames.any()
 
 
 def test_mark_and_compact_cells_equal_their_twins(grid, cloud):
-    blocks = touch(grid, cloud.points)
-    counts, sums = blocks.bin(cloud.points, cloud.normals, False)
-    n, voxels = blocks.count, blocks.voxels
-    rows = reference.compact_cells(counts[:n], sums[:n] / binning.FIXED)
-    lattice = {cell: value[0] for cell, value in by_cell(voxels, counts, sums).items()}
-    occupied_before = counts[:n] > 0
-    points_before = counts[:n].sum(axis=1)
+    clouds = cloud, moved(taken(cloud, slice(300)), (0.07, 0, 0))
+    blocks = touch(grid, *clouds)
+    sums, frames = blocks.bin(*clouds, with_positions=False)
+    n, voxels, bits = blocks.count, blocks.voxels, frames.copy()
+    counts = sums[:n, :, 0].copy()
+    averages = reference.compact_cells(counts, sums[:n, :, 1:] / binning.FIXED)
+    lattice = {cell: value[0] for cell, value in by_cell(voxels, sums).items()}
     for minimum in (1, 3):
         masks, support = np.zeros((n, 2), np.uint32), np.zeros((n, 2), np.uint32)
-        totals, occupied = np.zeros(n, np.int32), np.zeros(n, np.int32)
-        binning.mark_cells(n, counts, minimum, masks, support, totals, occupied)
+        rows, frames = np.zeros((n, 3), np.int32), bits.copy()
+        binning.mark_cells(n, sums, minimum, frames, masks, support, rows)
         for found, least in ((masks, 1), (support, minimum)):
             twin = reference.mark_cells(lattice, least)
             np.testing.assert_array_equal(
                 reference.unpack_masks(found), [twin[key] for key in voxels]
             )
-        np.testing.assert_array_equal(totals, points_before)
-        np.testing.assert_array_equal(occupied, occupied_before.sum(axis=1))
-    starts, cells = (np.cumsum(occupied) - occupied).astype(np.int32), np.zeros((len(rows), 4))
-    cells = cells.astype(np.float32)
-    binning.compact_cells(n, starts, masks, 3, counts, sums, cells)
-    np.testing.assert_allclose(cells, rows, rtol=FIXED, atol=FIXED)
-    assert not counts.any() and not sums.any()
+        np.testing.assert_array_equal(rows[:, 0], (counts > 0).sum(axis=1))
+        np.testing.assert_array_equal(rows[:, 1], counts.sum(axis=1))
+        np.testing.assert_array_equal(rows[:, 2], bits[:n])
+        assert not frames[:n].any() and len(np.unique(rows[:, 2])) == 3
+    rows[:, 0] = np.cumsum(rows[:, 0]) - rows[:, 0]
+    cells = np.zeros((len(averages), 4), np.float32)
+    binning.compact_cells(n, rows, masks, 3, sums, cells)
+    np.testing.assert_allclose(cells, averages, rtol=FIXED, atol=FIXED)
+    assert not sums.any()
+
+
+def test_more_than_31_frames_have_bits_of_their_own(grid, cloud):
+    """A window holds 32 frames at most; bit 31 is the sign of a whole number."""
+    few = taken(cloud, slice(40))
+    blocks = touch(grid, few)
+    sums, frames = blocks.bin(*[few] * 32)
+    assert (frames[: blocks.count] == 2**32 - 1).all()
+    n = blocks.count
+    masks, support, rows = *np.zeros((2, n, 2), np.uint32), np.zeros((n, 3), np.int32)
+    binning.mark_cells(n, sums, 1, frames, masks, support, rows)
+    assert (rows[:, 2] == -1).all()
+
+
+def carrying(points, values) -> tuple[Patches, list[Values]]:
+    """What `Binner.bin` takes: patches of a pixel each, and three values beside every point."""
+    patches = patches_of(PointCloud(points), "cpu")
+    return patches, [Values(values, patches.counts)]
 
 
 def test_a_frame_of_more_voxels_than_expected_is_given_room(grid):
     """Also where only the samples beside the points are too many: what was begun leaves no trace."""
     rng = np.random.default_rng(2)
     scattered = rng.uniform(-1, 1, (3000, 3)).astype(np.float32)
-    binned = Binner(grid, VS, 3).bin(scattered, [scattered])
+    binned = Binner(grid, VS, 3).bin(*carrying(scattered, scattered))
     voxels = set(map(tuple, binned.keys.to_numpy()[: binned.count].tolist()))
     assert binned.count > FIRST_BLOCKS
     assert voxels == reference.touch_points(in_voxels(scattered))
-    assert binned.totals.to_numpy()[: binned.count].sum() == len(scattered)
+    assert binned.rows[:, 1].sum() == len(scattered)
 
     other = VoxelGrid([latents(2, 3), WEIGHTS, MASKS])
     points = rng.uniform(-1, 1, (2 * binned.keys.shape[0] - 1500, 3)).astype(np.float32)
     normals = np.tile(np.float32([0, 0, 1]), (len(points), 1))
     binner = SurfelBinner(other, VS, np.float32([-1, 0, 1]), support_points=1, with_normals=False)
     for _ in range(2):
-        found = binner.bin(points, [normals])
+        found = binner.bin(*carrying(points, normals))
         wanted = reference.touch_surfel_samples(
             in_voxels(points), normals.astype(float), [-1.0, 0.0, 1.0]
         )
         assert set(map(tuple, found.keys.to_numpy()[: found.count].tolist())) == wanted
-        assert found.totals.to_numpy()[: found.count].sum() == 3 * len(points)
+        assert found.rows[:, 1].sum() == 3 * len(points)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 410.0, -410.0, 1e30])
@@ -235,4 +346,4 @@ def test_points_outside_the_index_range_are_refused_and_counted(grid, cloud, bad
     points = cloud.points.copy()
     points[[3, 77], [0, 2]] = bad
     with pytest.raises(OutOfRange, match="2 of 1200 points lie more than 410 m"):
-        Binner(grid, VS, 3).bin(points, [cloud.normals])
+        Binner(grid, VS, 3).bin(*carrying(points, cloud.normals))

@@ -14,7 +14,7 @@ from taichi_unifusion import runtime
 from taichi_unifusion.errors import CapacityError, RuntimeStateError
 from taichi_unifusion.kernels import index as kernels
 from taichi_unifusion.maps import voxel_grid
-from taichi_unifusion.maps.binner import Binner
+from taichi_unifusion.maps.binner import Binner, patches_of
 from taichi_unifusion.maps.pool import VoxelField
 from taichi_unifusion.maps.voxel_grid import EVIDENCE, MASKS, WEIGHTS, VoxelGrid, latents
 
@@ -38,12 +38,17 @@ def in_voxels(points) -> np.ndarray:
 def touch(grid: VoxelGrid, points) -> np.ndarray:
     """Voxels (B, 3) that points touch in a new frame."""
     keys, counters = np.zeros((4000, 3), np.int32), np.zeros(2, np.int32)
-    kernels.touch_points(points, 1 / VS, grid.next_frame(), 32, False, grid.index, counters, keys)
+    found, counts = np.ones(len(points), np.int32), np.ones(len(points), np.int32)
+    stamp = grid.next_frame()
+    kernels.touch_points(
+        found, 1, points, counts, 1 / VS, stamp, False, grid.index, counters, keys
+    )
     return keys[: counters[0]].copy()
 
 
-def test_claim_gather_and_copy_equal_a_dict(cloud):
+def test_claim_gather_and_copy_equal_a_dict(cloud, monkeypatch):
     """Slots are given once, in any order; export is sorted; growth keeps everything."""
+    monkeypatch.setattr(voxel_grid, "FIRST_CAPACITY", 4096)
     grid, kept, rng = a_grid(latents(2, 3)), {}, np.random.default_rng(4)
     for _ in range(3):
         # more than the first room in total
@@ -293,4 +298,5 @@ def test_a_grid_of_another_runtime_is_refused(cloud, monkeypatch):
     with pytest.raises(RuntimeStateError, match="before Taichi was started again"):
         grid.export()
     with pytest.raises(RuntimeStateError, match="before Taichi was started again"):
-        Binner(grid, VS, 1).bin(cloud.points, [cloud.attributes["one"]])
+        patches = patches_of(cloud, "cpu")
+        Binner(grid, VS, 1).bin(patches, [patches.attributes["one"]])
