@@ -1,4 +1,4 @@
-"""The kernels that let a frame's rays vote, against their twins."""
+"""The kernels that let the rays of frames vote, against their twins."""
 
 from __future__ import annotations
 
@@ -57,20 +57,23 @@ def pack_masks(masks: np.ndarray) -> np.ndarray:
     return np.packbits(masks, axis=1).view(">u4").astype(np.uint32)
 
 
-def vote(voxels: dict, depth: np.ndarray, T: np.ndarray, sign: int, evidence: np.ndarray) -> None:
+def vote(
+    voxels: dict, depth: np.ndarray, T: np.ndarray, sign: int, evidence: np.ndarray, slots=None
+) -> None:
+    """Votes of a view, or of several: depth (H, W) or (K, H, W) and T (4, 4) or (K, 4, 4)."""
     target = SurfaceMap(encoder=ENCODER)
     keys = np.array(list(voxels), np.int32)
     kernels.vote_cells(
         ENCODER.rank,
-        len(keys),
+        *(slots or (0, len(keys))),
         keys,
         pack_masks(np.array([v.mask for v in voxels.values()])),
         np.array([v.F for v in voxels.values()], np.float32),
         target.cell_gradients.to_numpy(),
         VS,
-        depth,
+        depth.reshape(-1, CAMERA.height, CAMERA.width),
         CAMERA.intrinsics,
-        np.ascontiguousarray(T[:3], np.float32),
+        np.ascontiguousarray(T.reshape(-1, 4, 4)[:, :3], np.float32),
         sign,
         evidence,
     )
@@ -92,13 +95,40 @@ def test_vote_cells_equals_its_twin(voxels, depth, T):
     wanted = np.array(
         list(
             twin.vote_cells(
-                reference.Encoder(ENCODER.rank, ENCODER.anchors), voxels, VS, depth, CAMERA, T
+                reference.Encoder(ENCODER.rank, ENCODER.anchors), voxels, VS, [depth], CAMERA, [T]
             ).values()
         )
     )
     assert min((wanted == v).sum() for v in (-1, 1)) > 100 and (evidence != wanted).mean() < FLIPPED
     vote(voxels, depth, T, -1, evidence)
     assert not evidence.any()
+
+
+def test_votes_of_several_views_are_those_of_each_and_equal_their_twin(voxels, depth):
+    """In one go, or slot by slot; images beyond the last pose are not read."""
+    poses = np.array(
+        [
+            pose((0.003, 0.0017, -0.0021)),
+            pose((0.1, -0.05, 0.02), 0.4, -0.3, 1.0),
+            pose((-0.2, 0.1, 0.3), -0.9),
+            pose((0.05, 0.0, -5.0)),  # sees nothing: all lies behind it
+        ]
+    )
+    images = np.array([depth, depth[::-1], np.roll(depth, 50, axis=1), depth, np.full_like(depth, 9)])
+    together, single, ranges = np.zeros((3, len(voxels), 64), np.int8)
+    vote(voxels, images, poses, 1, together)
+    for T, image in zip(poses, images[:4], strict=True):
+        vote(voxels, image, T, 1, single)
+    for slots in ((0, 50), (50, 51), (51, 51), (51, len(voxels))):
+        vote(voxels, images, poses, 1, ranges, slots)
+    np.testing.assert_array_equal(together, single)
+    np.testing.assert_array_equal(together, ranges)
+    encoder = reference.Encoder(ENCODER.rank, ENCODER.anchors)
+    twins = twin.vote_cells(encoder, voxels, VS, images[:4], CAMERA, poses)
+    wanted = np.array(list(twins.values()))
+    assert (together != wanted).mean() < 3 * FLIPPED and np.abs(wanted).max() > 1
+    vote(voxels, images, poses, -1, together)
+    assert not together.any()
 
 
 def test_votes_stay_within_what_a_cell_can_hold(voxels, depth):

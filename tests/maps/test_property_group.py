@@ -9,8 +9,9 @@ from scenes import cloud_of, rough
 
 from taichi_unifusion import PointCloud, PropertyMap, load_map
 from taichi_unifusion.errors import CapacityError, InputError
+from taichi_unifusion.kernels.patches import Values
 from taichi_unifusion.maps import PropertyGroup
-from taichi_unifusion.maps.binner import Binner
+from taichi_unifusion.maps.binner import Binner, patches_of
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.property_group import group_maps
 
@@ -120,16 +121,17 @@ def test_values_are_summed_in_cells_to_the_bit_as_one_array_is(parts):
     cloud = rough(6, count=3000)
     grid = PropertyMap("rgb", 3, voxel_size=0.05).grid
     values = [cloud.attributes["rgb"], *[cloud.attributes["one"] * n for n in range(1, parts)]]
-    found = []
+    patches, found = patches_of(cloud, "cpu"), []
     for together in (False, True):
+        given = values if together else [np.hstack(values)]
         binned = Binner(grid, 0.05, 2 + parts).bin(
-            cloud.points, values if together else [np.hstack(values)]
+            patches, [Values(each, patches.counts) for each in given]
         )
         n, cells = binned.count, binned.cells.to_numpy()
-        keys, totals = binned.keys.to_numpy()[:n], binned.totals.to_numpy()[:n]
+        keys, (starts, totals, _) = binned.keys.to_numpy()[:n], binned.rows.T
         order = np.lexsort(keys.T)  # blocks are numbered as threads come
         occupied = unpack_masks(binned.masks.to_numpy()[:n]).sum(axis=1)
-        rows = [cells[start : start + m] for start, m in zip(binned.starts, occupied, strict=True)]
+        rows = [cells[start : start + m] for start, m in zip(starts, occupied, strict=True)]
         found.append((totals[order], np.concatenate([rows[b] for b in order])))
     assert found[0][0].sum() == len(cloud)
     for one, together in zip(*found, strict=True):

@@ -62,8 +62,19 @@ def vote_of_surface(p, normal, voxel_size, depth, camera):
     return 1 if behind > -slack else 0
 
 
-def vote_cells(encoder, voxels, voxel_size, depth, camera, T_camera_world):
-    """Voxel -> (64,) votes of one frame."""
+def vote_cells(encoder, voxels, voxel_size, depths, camera, poses):
+    """Voxel -> (64,) votes of some views, taken from poses T_camera_world: the sum of what each of
+    them votes.
+    """
+    views = [
+        votes_of_view(encoder, voxels, voxel_size, depth, camera, T)
+        for depth, T in zip(depths, poses, strict=True)
+    ]
+    return {key: sum(view[key] for view in views) for key in voxels}
+
+
+def votes_of_view(encoder, voxels, voxel_size, depth, camera, T_camera_world):
+    """Voxel -> (64,) votes of one view."""
     t = (CENTERS - 0.5) / 2
     f, slopes = encoder(t), 0.5 * encoder.gradient(t)  # t moves by half a voxel a voxel
     R, origin = T_camera_world[:3, :3], T_camera_world[:3, 3]
