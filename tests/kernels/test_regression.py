@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import reference
 from oracle import assert_equal_maps, encoder_of, in_voxels
-from scenes import rough
+from scenes import moved, rough
 
 from taichi_unifusion.kernels import fusion
 from taichi_unifusion.kernels.layout import Layout
 from taichi_unifusion.kernels.regression import TILE
 from taichi_unifusion.maps import PropertyMap, SurfaceMap
+from taichi_unifusion.maps.binner import patches_of
 from taichi_unifusion.maps.encoding import EncoderSettings
+from taichi_unifusion.maps.local_lim import CellArrays
+from taichi_unifusion.runtime import Arena
 
 SIX_RANKS = {"encoder": EncoderSettings(rank=6, anchors=64), "noise": 0.3, "voxel_size": 0.05}
 
@@ -86,6 +91,65 @@ def test_property_regression_equals_the_oracle(name, channels, prior, sampling, 
     for cloud in clouds:
         target.integrate(cloud)
     assert_equal_maps(target, property_twin(target, *clouds))
+
+
+def fuse_as_one(target: SurfaceMap | PropertyMap, clouds, ranges: int = 1) -> None:
+    """Sum clouds up as frames of one window, encode it in so many ranges of blocks, and fuse it."""
+    cells = target.binner.open(CellArrays(target.binner.width))
+    for n, cloud in enumerate(clouds):
+        patches = patches_of(cloud, "cpu")
+        cells = target.binner.touch(cells, patches)
+        target.binner.add(cells, patches, [target.carried(patches)], n)
+    binned = target.binner.close(cells, Arena())
+    local = target.encoder.room(binned)
+    ends = np.linspace(0, binned.count, ranges + 1).astype(int)
+    for begin, end in pairwise(ends):
+        target.encoder.encode_blocks(binned, int(begin), int(end), local)
+    target.grid.fuse(local)
+
+
+def window_of() -> list:
+    """Three frames; some voxels are seen by all, and some by one."""
+    return [rough(0), moved(rough(1, 900), (0.1, 0.02, 0)), moved(rough(2, 600), (-0.07, 0.3, 0.1))]
+
+
+def side_by_side(clouds, settings):
+    """Positions [voxels] and frame numbers of the points of some clouds."""
+    frames = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
+    return np.vstack([in_voxels(cloud, settings) for cloud in clouds]), frames
+
+
+@pytest.mark.parametrize("gpis", ["samples", "derivatives"])
+def test_a_surface_window_equals_the_oracle(gpis):
+    """Noise is a frame's: three frames in one regression have three times that of one, in every
+    voxel that all of them saw.
+    """
+    target = SurfaceMap(gpis=gpis, min_points=5, sample_distance=0.2, **SIX_RANKS)
+    clouds, settings, encoder = window_of(), target.settings, encoder_of(target.settings)
+    fuse_as_one(target, clouds, ranges=3)
+    x, frames = side_by_side(clouds, settings)
+    normals = np.vstack([cloud.normals for cloud in clouds]).astype(float)
+    twin = reference.surface_frame(encoder, x, normals, settings, frames=frames)
+    assert_equal_maps(target, twin)
+    # the numbers of frames matter, and differ
+    for wrong in (np.zeros(len(x), int), np.arange(len(x)) % 3):
+        other = reference.surface_frame(encoder, x, normals, settings, frames=wrong)
+        with pytest.raises(AssertionError, match="Not equal to tolerance"):
+            assert_equal_maps(target, other)
+
+
+@pytest.mark.parametrize("margin", [1, 2])
+def test_a_property_window_equals_the_oracle(margin):
+    target = PropertyMap("rgb", 3, margin=margin, min_points=3, **SIX_RANKS)
+    clouds, settings = window_of(), target.settings
+    fuse_as_one(target, clouds, ranges=3)
+    x, frames = side_by_side(clouds, settings)
+    values = np.vstack([cloud.attributes["rgb"] for cloud in clouds]).astype(float)
+    twin = reference.property_frame(encoder_of(settings), x, values, settings, frames=frames)
+    assert_equal_maps(target, twin)
+    other = reference.property_frame(encoder_of(settings), x, values, settings)
+    with pytest.raises(AssertionError, match="Not equal to tolerance"):
+        assert_equal_maps(target, other)
 
 
 def test_fuse_equals_its_twin():
