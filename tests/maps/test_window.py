@@ -1,0 +1,380 @@
+"""Frames in windows: their order, what is refused, where windows end, and what reading them does."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from places import DEVICE
+from windows import (
+    CAMERA,
+    CONFIG,
+    RUNS,
+    SINGLE,
+    assert_close,
+    contents,
+    empty,
+    seen_from,
+    stepped,
+    turned,
+    walk,
+    windows,
+    with_value,
+)
+
+from taichi_unifusion import PinholeCamera, load_map, preprocess
+from taichi_unifusion.config import Config
+from taichi_unifusion.errors import CapacityError, OutOfRange
+from taichi_unifusion.maps import PropertyMap, SurfaceMap, voxel_grid
+from taichi_unifusion.maps.window import FARTHEST_MOVE, GAP, LARGEST_TURN
+from taichi_unifusion.pipeline import Pipeline
+from taichi_unifusion.run_log import EmptyFrame
+
+ORDER = 1e-5  # relative: Eq. 19 in float32, windows in another order
+WEIGHT = 1e-6  # relative: a cell's count is the square of its root, in float32
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Neighbours, all of which fit into one window."""
+    return walk(8)
+
+
+@pytest.fixture(scope="module")
+def fused(frames):
+    """What two windows of four frames give."""
+    return contents(stepped(frames))
+
+
+# ---- Order ----
+
+
+@pytest.mark.parametrize("order", [(3, 1, 0, 2), (1, 3, 2, 0)])
+def test_the_order_of_frames_in_a_window_does_not_matter(frames, fused, order):
+    """To the bit: sums are whole numbers."""
+    mixed = [frames[n] for n in (*order, *(4 + n for n in reversed(order)))]
+    assert contents(stepped(mixed)) == fused
+
+
+def test_the_order_of_windows_matters_to_rounding_only(frames, fused):
+    """But votes are cast on the surface as it is by then: those of the first window on its own. What
+    these miss or cast where the other one moves the surface is its four frames at most.
+    """
+    there, back = stepped(frames), stepped([*frames[4:], *frames[:4]])
+    for name in there.maps:
+        assert_close(there.maps[name], back.maps[name], ORDER)
+    evidence, other = (each.surface.voxels().evidence.astype(int) for each in (there, back))
+    assert np.abs(evidence - other).max() <= 4 and (evidence != other).mean() < 0.2
+    assert np.abs(evidence).max() == len(frames)
+
+
+def test_another_process_with_one_thread_writes_the_same_bytes_and_goes_on_from_files(
+    frames, tmp_path
+):
+    """Saved in mid-window, and loaded by a process that goes on: as if it had been this one."""
+    pipeline = stepped(frames[:6])
+    for name, each in pipeline.maps.items():
+        each.save(tmp_path / f"half {name}")
+    for frame in frames[6:]:
+        pipeline.step(frame)
+    script = (
+        f"import sys; sys.path[:0] = {sys.path!r}\n"
+        f"import taichi_unifusion as uf; uf.init({DEVICE!r}, threads=1)\n"
+        "from windows import *\n"
+        "all_of_it, resumed = stepped(walk(6)), Pipeline(CONFIG)\n"
+        "for name, each in all_of_it.maps.items():\n"
+        f"    each.save({str(tmp_path)!r} + f'/one thread {{name}}')\n"
+        f"    resumed.maps[name].merge(uf.load_map({str(tmp_path)!r} + f'/half {{name}}'))\n"
+        "for frame in walk(8)[6:]:\n"
+        "    resumed.step(frame)\n"
+        "for name, each in resumed.maps.items():\n"
+        f"    each.save({str(tmp_path)!r} + f'/resumed {{name}}')\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=300)
+    for name, each in pipeline.maps.items():
+        each.save(tmp_path / f"here {name}")
+        files = {kind: (tmp_path / f"{kind} {name}").read_bytes() for kind in
+                 ("half", "one thread", "here", "resumed")}  # fmt: skip
+        assert files["half"] == files["one thread"] and files["here"] == files["resumed"]
+
+
+# ---- Against single frames ----
+
+
+@pytest.mark.parametrize("gpis", ["samples", "derivatives"])
+def test_a_window_of_one_frame_is_integrating_its_cloud(gpis):
+    frames = [seen_from(turned(n), n) for n in range(3)]
+    config = replace(SINGLE, surface=replace(SINGLE.surface, gpis=gpis))
+    pipeline = stepped(frames, config)
+    surface, color = SurfaceMap(config.surface), PropertyMap("color", 3, config.color)
+    for frame in frames:
+        cloud = preprocess(frame, config.preprocess).transformed(frame.T_world_camera)
+        surface.integrate(cloud)
+        color.integrate(cloud)
+    assert_close(pipeline.surface, surface, RUNS)
+    assert_close(pipeline.maps["color"], color, RUNS)
+    np.testing.assert_array_equal(
+        pipeline.surface.voxels().evidence, surface.voxels().evidence
+    )
+    assert len(surface) > 200
+
+
+def part_of(frame, columns: slice):
+    depth = np.zeros_like(frame.depth)
+    depth[:, columns] = frame.depth[:, columns]
+    return replace(frame, depth=depth)
+
+
+def test_frames_that_do_not_overlap_are_the_same_in_one_window_to_the_bit():
+    """Noise is that of the frames that saw a voxel, not of all in its window."""
+    whole = walk(1)[0]
+    apart = [
+        replace(part_of(whole, columns), index=n + 1)
+        for n, columns in enumerate((slice(0, 18), slice(45, 64)))
+    ]
+    assert windows(apart) == [1, 2]
+    together, alone = contents(stepped(apart)), contents(stepped(apart, SINGLE))
+    assert together == alone
+    again = [*apart, replace(apart[0], index=3)]  # overlaps: now a window is not the same
+    assert contents(stepped(again)) != contents(stepped(again, SINGLE))
+
+
+def test_frames_that_see_the_same_twice_have_twice_its_noise(frames):
+    """A window of a frame and its copies is that frame, with their weight."""
+    every = {"min_points": 1}  # a voxel with too few points of one frame has enough in three
+    config = replace(
+        CONFIG,
+        surface=replace(CONFIG.surface, **every),
+        color=replace(CONFIG.color, **every),
+    )
+    once, thrice = stepped(frames[:1], config), stepped([frames[0]] * 3, config)
+    for name in once.maps:
+        one, three = (each.maps[name].voxels() for each in (once, thrice))
+        np.testing.assert_allclose(three.weights, 3 * one.weights, rtol=WEIGHT)
+        scale = np.abs(one.latents).max()
+        np.testing.assert_allclose(three.latents, one.latents, atol=ORDER * scale)
+
+
+# ---- What is refused ----
+
+
+def refuse(pipeline: Pipeline, frame, error: type[Exception]) -> None:
+    before = {name: len(each.grid) for name, each in pipeline.maps.items()}
+    with pytest.raises(error):
+        pipeline.step(frame)
+    assert {name: len(each.grid) for name, each in pipeline.maps.items()} == before
+
+
+def test_a_frame_without_depth_in_mid_window_leaves_no_trace(frames, fused):
+    pipeline = stepped(frames[:2])
+    refuse(pipeline, empty(frames[2]), EmptyFrame)
+    for frame in frames[2:]:
+        pipeline.step(frame)
+    assert contents(pipeline) == fused
+
+
+def test_a_frame_beyond_the_range_of_one_map_in_mid_window_leaves_no_trace():
+    """The colours' voxels are finer and end nearer: the surface's were touched by then."""
+    config = replace(CONFIG, color=replace(CONFIG.color, voxel_size=0.05))
+    # the wall in front stands 6 cm before the border at 8191 voxels, or behind it
+    border = 8191 * 0.05 - 1.5
+    frames = [
+        seen_from(turned(n), n + 1, origin=(border + beyond, 0, 0))
+        for n, beyond in enumerate((-0.1, -0.1, 0.1, -0.1, -0.1))
+    ]
+    pipeline = stepped(frames[:2], config)
+    refuse(pipeline, frames[2], OutOfRange)
+    assert len(pipeline.fusion.window) == 2
+    for frame in frames[3:]:
+        pipeline.step(frame)
+    assert contents(pipeline) == contents(stepped([*frames[:2], *frames[3:]], config))
+
+
+def test_a_frame_that_is_far_off_ends_the_window_and_is_refused(frames):
+    pipeline, T = stepped(frames[:2]), frames[2].T_world_camera.copy()
+    T[0, 3] = 1e6
+    refuse(pipeline, replace(frames[2], T_world_camera=T), OutOfRange)
+    assert pipeline.fusion.window is None
+    for frame in frames[3:6]:
+        pipeline.step(frame)
+    others = stepped(frames[:2])
+    others.flush()
+    for frame in frames[3:6]:
+        others.step(frame)
+    assert contents(pipeline) == contents(others)
+
+
+def test_a_frame_too_many_in_mid_window_leaves_no_trace(frames, fused, monkeypatch):
+    pipeline = stepped(frames[:2])
+    with monkeypatch.context() as patched:
+        patched.setattr(voxel_grid, "SPARSE_LIMIT", 1)
+        refuse(pipeline, frames[2], CapacityError)
+        assert len(pipeline.fusion.window) == 2
+    for frame in frames[2:]:
+        pipeline.step(frame)
+    assert contents(pipeline) == fused
+
+
+def test_what_was_summed_up_before_a_limit_can_be_read_after_it(frames, monkeypatch):
+    """What a window holds has its room, whatever comes after."""
+    whole = contents(stepped(frames[:6]))
+    pipeline = stepped(frames[:6])
+    with monkeypatch.context() as patched:
+        patched.setattr(voxel_grid, "SPARSE_POOL", 1)
+        refuse(pipeline, frames[6], CapacityError)
+    assert contents(pipeline) == whole and len(pipeline.extract_mesh(2).faces) > 100
+
+
+# ---- Where a window ends ----
+
+
+def two(first, second, config: Config = CONFIG) -> int:
+    """How many frames are in the window after both."""
+    return windows([first, second], config)[-1]
+
+
+def test_a_window_ends_with_so_many_frames(frames):
+    assert windows(frames) == [1, 2, 3, 0, 1, 2, 3, 0]
+    assert windows(frames[:3], SINGLE) == [0, 0, 0]
+    assert windows(frames[:3], replace(CONFIG, window=2)) == [1, 0, 1]
+
+
+def moved_by(frame, metres: float = 0.0, degrees: float = 0.0):
+    a = np.radians(degrees)
+    T = np.eye(4)
+    T[:3, :3] = [[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]
+    T[0, 3] = metres
+    return seen_from(frame.T_world_camera @ T, frame.index + 1)
+
+
+@pytest.mark.parametrize(
+    ("step", "count"),
+    [
+        ({"metres": FARTHEST_MOVE - 0.01}, 2),
+        ({"metres": FARTHEST_MOVE + 0.01}, 1),
+        ({"degrees": LARGEST_TURN - 0.1}, 2),
+        ({"degrees": LARGEST_TURN + 0.1}, 1),
+    ],
+)
+def test_a_window_ends_where_the_camera_has_moved_or_turned(frames, step, count):
+    """From its first frame, not from the one before."""
+    assert two(frames[0], moved_by(frames[0], **step)) == count
+    third = [frames[0], frames[1], moved_by(frames[0], **step)]
+    assert windows(third)[-1] == (3 if count == 2 else 1)
+
+
+def test_a_window_ends_at_a_gap_in_the_recording(frames):
+    numbered = [replace(frame, index=10 * n + 5) for n, frame in enumerate(frames[:3])]
+    after, gap = (
+        replace(frames[3], index=25 + 10 * GAP + more) for more in (0, 1)
+    )
+    every_frame = replace(CONFIG, window=8)
+    assert windows([*numbered, after], every_frame) == [1, 2, 3, 4]
+    assert windows([*numbered, gap], every_frame) == [1, 2, 3, 1]
+
+
+def test_a_window_ends_where_another_camera_takes_over(frames):
+    other = PinholeCamera(64, 48, 55.0, 55.0, 30.0, 23.5)
+    smaller = PinholeCamera(48, 36, 41.25, 41.25, 23.5, 17.5)
+    for camera in (other, smaller):
+        taken = [frames[0], frames[1], *walk(4, camera=camera)[2:]]
+        assert windows(taken) == [1, 2, 1, 2]
+        assert contents(stepped(taken)) == contents(stepped(taken))  # and back, from the pool
+    assert camera != CAMERA
+
+
+def test_a_window_ends_where_frames_carry_something_else(frames):
+    plain, other = frames[:2]
+    assert two(plain, replace(other, color=None)) == 1
+    assert two(plain, with_value(other)) == 1
+    assert two(with_value(plain), with_value(other)) == 2
+    # an image in which not all values are numbers leaves out points
+    assert two(with_value(plain), with_value(other, holes=True)) == 1
+    assert two(with_value(plain, holes=True), with_value(other, holes=True)) == 2
+
+
+# ---- Reading ----
+
+
+def inside(pipeline: Pipeline) -> np.ndarray:
+    return pipeline.surface.extract_mesh(2).vertices[:5]
+
+
+PROBES = np.array([[1.5, 0.1, 0.1], [1.4, 0.0, 0.2]])
+READINGS = {
+    "len": lambda p, path: len(p.surface),
+    "memory": lambda p, path: p.surface.memory_bytes,
+    "voxels": lambda p, path: p.surface.voxels(),
+    "sdf": lambda p, path: p.surface.sdf(PROBES),
+    "mesh": lambda p, path: p.surface.extract_mesh(2),
+    "coloured mesh": lambda p, path: p.extract_mesh(2),
+    "query": lambda p, path: p.maps["color"].query(PROBES),
+    "save": lambda p, path: p.maps["color"].save(path),
+    "merge": lambda p, path: p.surface.merge(SurfaceMap(CONFIG.surface)),
+    "be merged": lambda p, path: SurfaceMap(CONFIG.surface).merge(p.surface),
+    "flush": lambda p, path: p.flush(),
+    "flush a map": lambda p, path: p.surface.flush(),
+}
+
+
+@pytest.mark.parametrize("reading", READINGS)
+def test_reading_in_mid_window_fuses_what_waits_first(frames, tmp_path, reading):
+    """And the next frame begins another window: as where one was fused there by name."""
+    pipeline, flushed = stepped(frames[:2]), stepped(frames[:2])
+    assert {each.waiting for each in pipeline.maps.values()} == {pipeline.fusion}
+    READINGS[reading](pipeline, tmp_path / "map")
+    assert [each.waiting for each in pipeline.maps.values()] == [None, None]
+    assert pipeline.fusion.window is None and not pipeline.fusion.pieces
+    flushed.flush()
+    assert len(pipeline.surface.grid) == len(flushed.surface.grid) > 0
+    for each in (pipeline, flushed):
+        each.step(frames[2])
+    assert contents(pipeline) == contents(flushed)
+
+
+@pytest.mark.parametrize("change", ["integrate", "remove"])
+def test_changing_a_map_in_mid_window_fuses_what_waits_first(frames, change):
+    cloud = preprocess(frames[5], CONFIG.preprocess).transformed(frames[5].T_world_camera)
+    pipeline, flushed = stepped(frames[:2]), stepped(frames[:2])
+    flushed.flush()
+    for each in (pipeline, flushed):
+        for target in each.maps.values():
+            getattr(target, change)(cloud)
+        each.step(frames[2])
+    assert contents(pipeline) == contents(flushed)
+
+
+def test_a_map_saved_in_mid_window_holds_all_frames(frames, tmp_path):
+    pipeline = stepped(frames[:6])
+    pipeline.surface.save(tmp_path / "map")
+    assert len(load_map(tmp_path / "map")) == len(pipeline.surface.grid)
+    whole = stepped(frames[:6])
+    whole.flush()
+    assert load_map(tmp_path / "map").voxels().weights.sum() == whole.surface.voxels().weights.sum()
+
+
+# ---- Slices ----
+
+
+def test_no_frame_waits_for_more_than_its_share_and_all_is_fused_before_the_next_window_is_full(
+    frames, monkeypatch
+):
+    pipeline = Pipeline(CONFIG)
+    counts = []
+    for n, frame in enumerate([*frames, *walk(12)[8:]]):
+        waiting = len(pipeline.fusion.pieces)
+        pipeline.step(frame)
+        left = len(pipeline.fusion.pieces)
+        if n % 4 == 3:  # this frame filled a window
+            assert waiting == 0
+            share = -(-left // 3)  # of what its three successors do
+        else:
+            done = waiting - left
+            counts.append(done)
+            assert waiting == 0 or 0 < done <= share
+        if n % 4 == 2:
+            assert left == 0
+    assert max(counts) < sum(counts) / 5
