@@ -610,26 +610,35 @@ def drop_flying_pixels(depth, jump, support):
     return inverse
 
 
+def slope_along(inverse, v, u, along, step, radius, jump):
+    """Mean slope of 1/z along `along` (dv, du), from pairs of pixels `step` before and after those
+    of a line across it through (v, u), where both belong with that pixel; and how many pairs.
+    """
+    along, across, at = np.array(along), np.array(along[::-1]), np.array([v, u])
+    q, slopes = inverse[v, u], []
+    for i in range(-radius, radius + 1):
+        ahead = inverse[tuple(at + i * across + step * along)]
+        behind = inverse[tuple(at + i * across - step * along)]
+        if max(abs(ahead - q), abs(behind - q)) < jump * q:
+            slopes.append((ahead - behind) / (2 * step))
+    return (np.mean(slopes) if slopes else 0.0), len(slopes)
+
+
 def inverse_depth_slope(inverse, v, u, radius, jump):
-    """Slopes of 1/z by u and v, least squares over the pairs of pixels on opposite edges of the
-    window that both belong with the centre; the smaller number of pairs.
+    """Slopes of 1/z by u and v and whether they are known: from pairs on opposite edges of the
+    window, or, where there is none, from at least four pairs of direct neighbours.
     """
     height, width = inverse.shape
-    slopes, pairs = np.zeros(2), np.zeros(2, int)
-    q = inverse[v, u]
-    if radius <= v < height - radius and radius <= u < width - radius:
-        for i in range(-radius, radius + 1):
-            for axis, (ahead, behind) in enumerate(
-                (
-                    (inverse[v + i, u + radius], inverse[v + i, u - radius]),
-                    (inverse[v + radius, u + i], inverse[v - radius, u + i]),
-                )
-            ):
-                if max(abs(ahead - q), abs(behind - q)) < jump * q:
-                    slopes[axis] += (ahead - behind) / (2 * radius)
-                    pairs[axis] += 1
-    slopes /= np.maximum(pairs, 1)
-    return slopes[0], slopes[1], pairs.min()
+    if not (radius <= v < height - radius and radius <= u < width - radius):
+        return 0.0, 0.0, False
+    slopes, known = [], True
+    for along in ((0, 1), (1, 0)):
+        slope, pairs = slope_along(inverse, v, u, along, radius, radius, jump)
+        if pairs == 0:
+            slope, pairs = slope_along(inverse, v, u, along, 1, radius, jump)
+            known = known and pairs >= 4
+        slopes.append(slope)
+    return *slopes, known
 
 
 def normal_towards_camera(q, slopes, v, u, fx, fy, cx, cy, cos_max_angle):
@@ -652,15 +661,15 @@ def estimate_normals(inverse, fx, fy, cx, cy, radius, jump, cos_max_angle):
     height, width = inverse.shape
     normals = np.zeros((height, width, 3))
     for top, left in product(range(0, height, 2), range(0, width, 2)):
-        fitted_at, found = 0, 0
+        fitted_at, known = 0, False
         for v, u in product(range(top, min(top + 2, height)), range(left, min(left + 2, width))):
             q = inverse[v, u]
             if q == 0:
                 continue
-            if found == 0 or abs(q - fitted_at) > 0.5 * jump * q:
-                slope_u, slope_v, found = inverse_depth_slope(inverse, v, u, radius, jump)
+            if not known or abs(q - fitted_at) > 0.5 * jump * q:
+                slope_u, slope_v, known = inverse_depth_slope(inverse, v, u, radius, jump)
                 fitted_at = q
-            if found > 0:
+            if known:
                 normal = normal_towards_camera(
                     q, (slope_u, slope_v), v, u, fx, fy, cx, cy, cos_max_angle
                 )

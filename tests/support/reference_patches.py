@@ -47,19 +47,19 @@ def make_patches(inverse, K, T_world_camera, radius, jump, cos_max_angle, least)
     across = (width + 1) // 2
     for quad in range((height + 1) // 2 * across):
         top, left = 2 * (quad // across), 2 * (quad % across)
-        fitted_at, patch = 0.0, None
+        fitted_at, known, patch = 0.0, False, None
         for p, (dv, du) in enumerate(QUAD):
             v, u = top + dv, left + du
             if v >= height or u >= width or inverse[v, u] == 0:
                 continue
             q = inverse[v, u]
             other = abs(q - fitted_at) > 0.5 * jump * q
-            if other:
+            if other or not known:
                 fitted_at = q
-                *slopes, pairs = inverse_depth_slope(inverse, v, u, radius, jump)
+                *slopes, known = inverse_depth_slope(inverse, v, u, radius, jump)
             if other or q < least:
                 patch = None
-            if patch is None and pairs > 0:
+            if patch is None and known:
                 normal = normal_towards_camera(q, slopes, v, u, *K, cos_max_angle)
                 if normal is not None:
                     patch = Patch(quad, T_world_camera[:3, :3] @ normal)
