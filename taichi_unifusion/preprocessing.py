@@ -156,7 +156,6 @@ def find_patches(
             float(np.cos(np.radians(settings.max_angle))),
             1.0 / spread if spread > 0 else float("inf"),
         ),
-        kernels.Sinks(write, surface.sink if surface else None, color.sink if color else None),
         (
             targets.sign,
             targets.frame,
@@ -164,6 +163,7 @@ def find_patches(
             color.stamp if color else 0,
             *targets.first,
         ),
+        kernels.Sinks(write, surface.sink if surface else None, color.sink if color else None),
         totals,
         (surface or _nothing()).keys,
         (surface or _nothing()).sums,

@@ -210,9 +210,9 @@ def make_patches(
     T_world_camera: Pose,
     radius: ti.template(),  # of the window of a normal [pixels]
     rules: Rules,
-    sinks: ti.template(),
     now: Now,
     # in and out:
+    sinks: ti.template(),  # new voxels get a block in their indices
     totals: Ints1,  # (4,) += [patches, pixels, blocks of the surface, blocks of the colours]
     keys_s: Ints2,  # (B, 5) of the surface: voxels of new blocks, and bits for the frame
     sums_s: Sums3,  # (B, 64, 7) += counts, normals, positions, as `bin_points` adds them
