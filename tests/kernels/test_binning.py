@@ -69,7 +69,7 @@ class Blocks:
 
     grid: VoxelGrid
     stamp: int
-    keys: np.ndarray  # (ROOM, 3)
+    keys: np.ndarray  # (ROOM, 5)
     counters: np.ndarray
 
     @property
@@ -79,7 +79,7 @@ class Blocks:
     @property
     def voxels(self) -> list[tuple]:
         """Voxel of each block."""
-        return list(map(tuple, self.keys[: self.count].tolist()))
+        return list(map(tuple, self.keys[: self.count, :3].tolist()))
 
     def touch(self, cloud: PointCloud) -> None:
         found, points, counts, _ = in_runs(cloud)
@@ -88,25 +88,31 @@ class Blocks:
             self.keys,
         )  # fmt: skip
 
-    def bin(self, *clouds: PointCloud, with_positions: bool = True):
-        """Sums (ROOM, 64, 1 + 3 [+ 3]), counts first, and frames (ROOM,) as bits, of clouds one
-        after the other.
-        """
+    @property
+    def point_frames(self) -> list[int]:
+        """Bits of the frames that have points in each block."""
+        return self.keys[: self.count, binning.POINT_FRAMES].tolist()
+
+    @property
+    def sample_frames(self) -> list[int]:
+        return self.keys[: self.count, binning.SAMPLE_FRAMES].tolist()
+
+    def bin(self, *clouds: PointCloud, with_positions: bool = True) -> np.ndarray:
+        """Sums (ROOM, 64, 1 + 3 [+ 3]), counts first, of clouds one after the other."""
         sums = np.zeros((ROOM, 64, 7 if with_positions else 4), np.int64)
-        frames = np.zeros(ROOM, np.uint32)
         for n, cloud in enumerate(clouds):
             found, points, counts, normals = in_runs(cloud)
             nothing, channels, index = [points] * 2, (3, 0, 0), self.grid.index
             binning.bin_points(
-                found, SLOTS, points, counts, normals, *nothing, channels, 1 / VS, 1 << n,
-                with_positions, index, sums, frames,
+                found, SLOTS, points, counts, normals, *nothing, channels, 1 / VS,
+                int(np.int32(np.uint32(1 << n))), with_positions, index, self.keys, sums,
             )  # fmt: skip
-        return sums, frames
+        return sums
 
 
 def touch(grid: VoxelGrid, *clouds: PointCloud) -> Blocks:
     blocks = Blocks(
-        grid, grid.next_frame(), np.zeros((ROOM, 3), np.int32), np.zeros(2, np.int32)
+        grid, grid.next_frame(), np.zeros((ROOM, 5), np.int32), np.zeros(2, np.int32)
     )
     for cloud in clouds:
         blocks.touch(cloud)
@@ -203,7 +209,7 @@ def test_bin_points_equals_its_twin(grid, cloud):
         for n, each in enumerate((cloud, moved(taken(cloud, slice(500)), (0.07, 0, 0))))
     ]
     blocks = touch(grid, *clouds)
-    sums, frames = blocks.bin(*clouds)
+    sums = blocks.bin(*clouds)
     x, normals, counts, frame_of = side_by_side(*clouds)
     binned, twin = by_cell(blocks.voxels, sums), reference.bin_points(x, normals, counts)
     assert binned.keys() == twin.keys() and max(count for count, _, _ in twin.values()) > 9
@@ -215,14 +221,14 @@ def test_bin_points_equals_its_twin(grid, cloud):
         )
     seen = reference.frames_in(x[counts > 0], frame_of[counts > 0])
     wanted = [bits_of(seen[key]) for key in blocks.voxels]
-    assert frames[: blocks.count].tolist() == wanted and set(wanted) == {1, 2, 3}
+    assert blocks.point_frames == wanted and set(wanted) == {1, 2, 3}
 
 
 def test_the_order_of_points_does_not_change_the_sums(grid, cloud):
     order, sums = np.random.default_rng(1).permutation(len(cloud)), []
     for rows in (slice(None), order):
         blocks = touch(grid, taken(cloud, rows))
-        sums.append(by_cell(blocks.voxels, blocks.bin(taken(cloud, rows))[0]))
+        sums.append(by_cell(blocks.voxels, blocks.bin(taken(cloud, rows))))
     assert sums[0].keys() == sums[1].keys()
     for cell, (count, mean) in sums[0].items():
         assert count == sums[1][cell][0]
@@ -230,25 +236,23 @@ def test_the_order_of_points_does_not_change_the_sums(grid, cloud):
 
 
 def surfel_samples(grid: VoxelGrid, *clouds: PointCloud):
-    """Blocks of the points and of their samples, the surfels' sums, those of the samples, and the
-    frames (ROOM,) that gave samples.
-    """
+    """Blocks of the points and of their samples, the surfels' sums, and those of the samples."""
     blocks = touch(grid, *clouds)
-    sums, frames = blocks.bin(*clouds)
+    sums = blocks.bin(*clouds)
     with_points = blocks.count
     binning.touch_surfel_samples(
         with_points, sums, OFFSETS, blocks.stamp, grid.index, blocks.keys, blocks.counters
     )
-    samples, sample_frames = np.zeros((ROOM, 64, 5), np.int64), np.zeros(ROOM, np.uint32)
+    samples = np.zeros((ROOM, 64, 5), np.int64)
     binning.bin_surfel_samples(
-        with_points, blocks.keys, frames, OFFSETS, True, grid.index, sums, samples, sample_frames
+        with_points, OFFSETS, True, grid.index, blocks.keys, sums, samples
     )
-    return with_points, blocks, sums, samples, sample_frames
+    return with_points, blocks, sums, samples
 
 
 def test_surfel_kernels_equal_their_twins(grid, cloud):
     clouds = cloud, moved(taken(cloud, slice(300)), (0.07, 0, 0))
-    with_points, blocks, surfels, samples, frames = surfel_samples(grid, *clouds)
+    with_points, blocks, surfels, samples = surfel_samples(grid, *clouds)
     x, normals, counts, frame_of = side_by_side(*clouds)
     offsets, voxels = OFFSETS.astype(float), blocks.voxels
     assert len(set(voxels)) == len(voxels)
@@ -263,27 +267,29 @@ def test_surfel_kernels_equal_their_twins(grid, cloud):
     assert not surfels.any()  # read last, left zero
     seen = reference.surfel_sample_frames(x, normals, offsets, frame_of)
     wanted = [bits_of(seen.get(key, set())) for key in voxels]
-    assert frames[: len(voxels)].tolist() == wanted and {1, 2, 3} <= set(wanted)
+    assert blocks.sample_frames == wanted and {1, 2, 3} <= set(wanted)
 
 
 def test_normals_that_cancel_give_no_samples(grid):
     cloud = cloud_of(np.full((2, 3), 0.006), [[0, 0, 1], [0, 0, -1]])
-    _, _, surfels, samples, frames = surfel_samples(grid, cloud)
-    assert not samples.any() and not surfels.any() and not frames.any()
+    _, blocks, surfels, samples = surfel_samples(grid, cloud)
+    assert not samples.any() and not surfels.any() and blocks.sample_frames == [0]
 
 
 def test_mark_and_compact_cells_equal_their_twins(grid, cloud):
     clouds = cloud, moved(taken(cloud, slice(300)), (0.07, 0, 0))
     blocks = touch(grid, *clouds)
-    sums, frames = blocks.bin(*clouds, with_positions=False)
-    n, voxels, bits = blocks.count, blocks.voxels, frames.copy()
+    sums = blocks.bin(*clouds, with_positions=False)
+    n, voxels = blocks.count, blocks.voxels
+    blocks.keys[:, binning.SAMPLE_FRAMES] = np.arange(ROOM)
+    bits = blocks.keys.copy()
     counts = sums[:n, :, 0].copy()
     averages = reference.compact_cells(counts, sums[:n, :, 1:] / binning.FIXED)
     lattice = {cell: value[0] for cell, value in by_cell(voxels, sums).items()}
-    for minimum in (1, 3):
+    for minimum, column in ((1, binning.POINT_FRAMES), (3, binning.SAMPLE_FRAMES)):
         masks, support = np.zeros((n, 2), np.uint32), np.zeros((n, 2), np.uint32)
-        rows, frames = np.zeros((n, 3), np.int32), bits.copy()
-        binning.mark_cells(n, sums, minimum, frames, masks, support, rows)
+        rows, keys = np.zeros((n, 3), np.int32), bits.copy()
+        binning.mark_cells(n, sums, minimum, column, keys, masks, support, rows)
         for found, least in ((masks, 1), (support, minimum)):
             twin = reference.mark_cells(lattice, least)
             np.testing.assert_array_equal(
@@ -291,8 +297,9 @@ def test_mark_and_compact_cells_equal_their_twins(grid, cloud):
             )
         np.testing.assert_array_equal(rows[:, 0], (counts > 0).sum(axis=1))
         np.testing.assert_array_equal(rows[:, 1], counts.sum(axis=1))
-        np.testing.assert_array_equal(rows[:, 2], bits[:n])
-        assert not frames[:n].any() and len(np.unique(rows[:, 2])) == 3
+        np.testing.assert_array_equal(rows[:, 2], bits[:n, column])
+        assert not keys[:n, 3:].any() and len(np.unique(rows[:, 2])) >= 3
+        np.testing.assert_array_equal(keys[:, :3], bits[:, :3])
     rows[:, 0] = np.cumsum(rows[:, 0]) - rows[:, 0]
     cells = np.zeros((len(averages), 4), np.float32)
     binning.compact_cells(n, rows, masks, 3, sums, cells)
@@ -304,11 +311,10 @@ def test_more_than_31_frames_have_bits_of_their_own(grid, cloud):
     """A window holds 32 frames at most; bit 31 is the sign of a whole number."""
     few = taken(cloud, slice(40))
     blocks = touch(grid, few)
-    sums, frames = blocks.bin(*[few] * 32)
-    assert (frames[: blocks.count] == 2**32 - 1).all()
-    n = blocks.count
+    sums, n = blocks.bin(*[few] * 32), blocks.count
+    assert blocks.point_frames == [-1] * n
     masks, support, rows = *np.zeros((2, n, 2), np.uint32), np.zeros((n, 3), np.int32)
-    binning.mark_cells(n, sums, 1, frames, masks, support, rows)
+    binning.mark_cells(n, sums, 1, binning.POINT_FRAMES, blocks.keys, masks, support, rows)
     assert (rows[:, 2] == -1).all()
 
 
@@ -323,7 +329,7 @@ def test_a_frame_of_more_voxels_than_expected_is_given_room(grid):
     rng = np.random.default_rng(2)
     scattered = rng.uniform(-1, 1, (3000, 3)).astype(np.float32)
     binned = Binner(grid, VS, 3).bin(*carrying(scattered, scattered))
-    voxels = set(map(tuple, binned.keys.to_numpy()[: binned.count].tolist()))
+    voxels = set(map(tuple, binned.keys.to_numpy()[: binned.count, :3].tolist()))
     assert binned.count > FIRST_BLOCKS
     assert voxels == reference.touch_points(in_voxels(scattered))
     assert binned.rows[:, 1].sum() == len(scattered)
@@ -337,7 +343,7 @@ def test_a_frame_of_more_voxels_than_expected_is_given_room(grid):
         wanted = reference.touch_surfel_samples(
             in_voxels(points), normals.astype(float), [-1.0, 0.0, 1.0]
         )
-        assert set(map(tuple, found.keys.to_numpy()[: found.count].tolist())) == wanted
+        assert set(map(tuple, found.keys.to_numpy()[: found.count, :3].tolist())) == wanted
         assert found.rows[:, 1].sum() == 3 * len(points)
 
 

@@ -128,7 +128,7 @@ def test_values_are_summed_in_cells_to_the_bit_as_one_array_is(parts):
             patches, [Values(each, patches.counts) for each in given]
         )
         n, cells = binned.count, binned.cells.to_numpy()
-        keys, (starts, totals, _) = binned.keys.to_numpy()[:n], binned.rows.T
+        keys, (starts, totals, _) = binned.keys.to_numpy()[:n, :3], binned.rows.T
         order = np.lexsort(keys.T)  # blocks are numbered as threads come
         occupied = unpack_masks(binned.masks.to_numpy()[:n]).sum(axis=1)
         rows = [cells[start : start + m] for start, m in zip(starts, occupied, strict=True)]
