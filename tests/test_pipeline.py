@@ -257,9 +257,9 @@ def test_R3_a_stop_ends_after_the_current_frame(pipeline, frames):
     assert nothing.interrupted and not nothing.steps and len(nothing.trajectory) == 0
 
 
-def test_F9_a_wrong_depth_scale_is_warned_of(pipeline, frames, tmp_path):
+def test_F9_a_wrong_depth_scale_is_warned_of(frames, tmp_path):
     frames = open_dataset("folder", write_folder(tmp_path / "recording", frames), depth_scale=25.0)
-    pipeline.config = replace(CONFIG, preprocess=PreprocessSettings(depth_max=1000))
+    pipeline = Pipeline(replace(CONFIG, preprocess=PreprocessSettings(depth_max=1000)))
     result = pipeline.run(frames)
     assert [("depth_scale 1000" in warning, "0.png" in warning) for warning in result.warnings] == [
         (True, True)

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from places import DEVICE
+from reference import unpack_masks
 from windows import (
     CAMERA,
     CONFIG,
@@ -34,6 +35,7 @@ from taichi_unifusion.pipeline import Pipeline
 from taichi_unifusion.run_log import EmptyFrame
 
 ORDER = 1e-5  # relative: Eq. 19 in float32, windows in another order
+VOTES = 0.05  # share of cells with surface that are seen in one order, and seen through in another
 WEIGHT = 1e-6  # relative: a cell's count is the square of its root, in float32
 
 
@@ -60,15 +62,17 @@ def test_the_order_of_frames_in_a_window_does_not_matter(frames, fused, order):
 
 
 def test_the_order_of_windows_matters_to_rounding_only(frames, fused):
-    """But votes are cast on the surface as it is by then: those of the first window on its own. What
-    these miss or cast where the other one moves the surface is its four frames at most.
+    """But votes are cast on the surface as it is by then: the first window's on its own, and not in
+    voxels that the other one brings. So counts differ, and what they say of the surface hardly.
     """
     there, back = stepped(frames), stepped([*frames[4:], *frames[:4]])
     for name in there.maps:
         assert_close(there.maps[name], back.maps[name], ORDER)
-    evidence, other = (each.surface.voxels().evidence.astype(int) for each in (there, back))
-    assert np.abs(evidence - other).max() <= 4 and (evidence != other).mean() < 0.2
-    assert np.abs(evidence).max() == len(frames)
+    a, b = there.surface.voxels(), back.surface.voxels()
+    supported = unpack_masks(a.masks)
+    evidence, other = (each.evidence.astype(int)[supported] for each in (a, b))
+    assert ((evidence > 0) != (other > 0)).mean() < VOTES
+    assert np.abs(evidence).max() == np.abs(other).max() == len(frames)
 
 
 def test_another_process_with_one_thread_writes_the_same_bytes_and_goes_on_from_files(
