@@ -21,6 +21,7 @@ from .errors import FrameError, InputError, UniFusionError
 from .kernels.patches import Patches
 from .language.source import FeatureSource
 from .maps import BaseMap, FeatureMap, Integration, PropertyMap, SurfaceMap
+from .maps.kept_window import KeptWindow
 from .maps.property_group import group_maps
 from .maps.window import WindowFusion
 from .networks.encoders import ImageEncoder
@@ -52,7 +53,7 @@ class Pipeline:
         pipeline.extract_mesh().save("kitchen.ply")
 
     With `synchronize` off, the times of stages are those of launching them: CUDA may then overlap
-    them.
+    them. `keep` is told of every window that was fused; `pipeline.fusion.take_out` undoes one.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Pipeline:
         encoder: ImageEncoder | None = None,
         *,
         synchronize: bool = True,
+        keep: Callable[[KeptWindow], None] | None = None,
     ) -> None:
         self.config = config = config or Config()
         self.synchronize = synchronize
@@ -76,7 +78,7 @@ class Pipeline:
         for source in made:  # maps of features wait for the first features
             self.maps[source.name] = source.make_map()
         self.groups = group_maps(self.maps.values())
-        self.fusion = WindowFusion(config.window)
+        self.fusion = WindowFusion(config.window, keep)
         finest = min(each.voxel_size for each in self.maps.values())
         patch_size = min(config.preprocess.patch_size, finest / 2)
         self._preprocess = replace(config.preprocess, patch_size=patch_size)
