@@ -134,10 +134,11 @@ class Pipeline:
                 with clock.stage(name):
                     done[name] = each.integrate_patches(patches)
         alone = [group for group in self.groups if not group.sums_up]
-        if alone:
-            with clock.stage("points"):
-                settings = replace(self._preprocess, patch_size=0.0)
-                cloud = preprocess(frame, settings).transformed(frame.require_pose())
+        if not alone:
+            return done
+        with clock.stage("points"):
+            settings = replace(self._preprocess, patch_size=0.0)
+            cloud = preprocess(frame, settings).transformed(frame.require_pose())
         for group in alone:
             if names := group.names_in(cloud):
                 with clock.stage(" + ".join(names)):

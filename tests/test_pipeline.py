@@ -106,7 +106,9 @@ def test_with_windows_of_one_frame_each_step_fuses_its_frame(frames):
 def test_a_run_fuses_all_frames(fused, frames):
     pipeline, result = fused
     assert [step.index for step in result.steps] == [0, 1, 2]
-    assert len(pipeline.surface) > 0 and all(each.waiting is None for each in pipeline.maps.values())
+    assert len(pipeline.surface) > 0 and all(
+        each.waiting is None for each in pipeline.maps.values()
+    )
     mesh = pipeline.extract_mesh()
     values, valid = pipeline.surface.sdf(mesh.vertices)
     assert (

@@ -43,7 +43,7 @@ PatchPack = ti.types.argpack(
 class Sink:
     """A map whose cells patches are summed in."""
 
-    index: Index
+    index: Index | None  # None in the place of one that there is not
     per_meter: float  # 1 / voxel size
 
 

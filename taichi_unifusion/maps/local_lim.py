@@ -33,9 +33,9 @@ class CellArrays:
         self.width = width
         blocks = max(FIRST_BYTES // self.block_bytes, FIRST_BLOCKS)
         # voxel of each block, and bits of the frames that saw it
-        self.keys = ti.ndarray(ti.i32, (blocks, KEY_COLUMNS))
+        self.keys: DeviceArray = ti.ndarray(ti.i32, (blocks, KEY_COLUMNS))
         # counts, then fixed-point sums of values, by cell
-        self.sums = ti.ndarray(ti.i64, (blocks, BLOCK_CELLS, 1 + width))
+        self.sums: DeviceArray = ti.ndarray(ti.i64, (blocks, BLOCK_CELLS, 1 + width))
 
     @property
     def block_bytes(self) -> int:
@@ -67,7 +67,7 @@ class CellArrays:
 def _grow(array: DeviceArray, rows: int, used: int) -> DeviceArray:
     if rows <= array.shape[0]:
         return array
-    larger = ti.ndarray(array.dtype, (grown(array.shape[0], rows), *array.shape[1:]))
+    larger: DeviceArray = ti.ndarray(array.dtype, (grown(array.shape[0], rows), *array.shape[1:]))
     if used:
         copy_rows(used, array, larger)
     return larger

@@ -54,10 +54,11 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         )
         beside = settings.sample_distance
         steps = (0.0,) if derivatives else (-beside, 0.0, beside)
-        self.binner: SurfelBinner = SurfelBinner(
+        self.steps = np.array(steps, np.float32)  # of samples along a normal [voxels]
+        self.binner = SurfelBinner(
             self.grid,
             settings.voxel_size,
-            np.array(steps, np.float32),
+            self.steps,
             support_points=settings.support_points,
             with_normals=derivatives,
         )
@@ -92,8 +93,8 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         """Samples at every point and beside it, as published, and their targets: x + a n -> a,
         x - a n -> -a, in voxels; with derivatives also the normals.
         """
-        count = len(self.binner.steps)
-        steps = np.repeat(self.binner.steps, len(points))[:, None]
+        count = len(self.steps)
+        steps = np.repeat(self.steps, len(points))[:, None]
         repeated = np.tile(normals, (count, 1))
         samples = np.tile(points, (count, 1)) + steps * np.float32(self.voxel_size) * repeated
         targets = np.hstack([steps, repeated]) if self.layout.derivatives else steps

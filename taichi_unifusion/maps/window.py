@@ -44,7 +44,7 @@ class Piece:
     """Some milliseconds of the work that fuses a window."""
 
     name: str  # of the maps that it is for
-    work: Callable[[], None]
+    work: Callable[[], object]
 
 
 Keep = Callable[[KeptWindow], None]
@@ -315,9 +315,8 @@ class WindowFusion:
         self.flush()
         for names, cells in kept.cells.items():
             part, arrays = self._known[names], self._room[names][0]
-            for each in part.maps:
-                if each.name in kept.visible:
-                    take_visible(each, kept.visible[each.name])
+            for each in _surfaces(part, kept):
+                take_visible(each, kept.visible[each.name])
             part.take_out(cells.encoded(part, arrays))
 
     def put_back(self, kept: KeptWindow) -> KeptWindow:
@@ -326,7 +325,7 @@ class WindowFusion:
         changes = {}
         for names, cells in kept.cells.items():
             part, arrays = self._known[names], self._room[names][0]
-            surfaces = [each for each in part.maps if each.name in kept.visible]
+            surfaces = _surfaces(part, kept)
             before = {each.name: Visible.of(each.grid) for each in surfaces}
             part.fuse(cells.encoded(part, arrays))
             for each in surfaces:
@@ -361,3 +360,10 @@ class WindowFusion:
             self.run(len(self.pieces))
             self._images = [ti.ndarray(ti.f32, shape) for _ in range(2 if self.size > 1 else 1)]
         return self._images[0]
+
+
+def _surfaces(part: Part, kept: KeptWindow) -> list[SurfaceMap]:
+    """The maps of a part in which the rays of a window voted."""
+    return [
+        each for each in part.maps if isinstance(each, SurfaceMap) and each.name in kept.visible
+    ]

@@ -111,9 +111,7 @@ class Blocks:
 
 
 def touch(grid: VoxelGrid, *clouds: PointCloud) -> Blocks:
-    blocks = Blocks(
-        grid, grid.next_frame(), np.zeros((ROOM, 5), np.int32), np.zeros(2, np.int32)
-    )
+    blocks = Blocks(grid, grid.next_frame(), np.zeros((ROOM, 5), np.int32), np.zeros(2, np.int32))
     for cloud in clouds:
         blocks.touch(cloud)
     return blocks
@@ -244,9 +242,7 @@ def surfel_samples(grid: VoxelGrid, *clouds: PointCloud):
         with_points, sums, OFFSETS, blocks.stamp, grid.index, blocks.keys, blocks.counters
     )
     samples = np.zeros((ROOM, 64, 5), np.int64)
-    binning.bin_surfel_samples(
-        with_points, OFFSETS, True, grid.index, blocks.keys, sums, samples
-    )
+    binning.bin_surfel_samples(with_points, OFFSETS, True, grid.index, blocks.keys, sums, samples)
     return with_points, blocks, sums, samples
 
 

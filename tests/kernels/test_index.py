@@ -40,9 +40,7 @@ def touch(grid: VoxelGrid, points) -> np.ndarray:
     keys, counters = np.zeros((4000, 3), np.int32), np.zeros(2, np.int32)
     found, counts = np.ones(len(points), np.int32), np.ones(len(points), np.int32)
     stamp = grid.next_frame()
-    kernels.touch_points(
-        found, 1, points, counts, 1 / VS, stamp, False, grid.index, counters, keys
-    )
+    kernels.touch_points(found, 1, points, counts, 1 / VS, stamp, False, grid.index, counters, keys)
     return keys[: counters[0]].copy()
 
 

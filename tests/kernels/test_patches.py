@@ -90,9 +90,7 @@ def make(
     found = made.pop("found")
     filled = (np.arange(slots) < found[:, None]).ravel()
     rows = {name: array[filled] for name, array in made.items()}
-    return Found(
-        found, **rows, totals=totals - (3, 4, 0, 0), filled=filled, rows=made["places"]
-    )
+    return Found(found, **rows, totals=totals - (3, 4, 0, 0), filled=filled, rows=made["places"])
 
 
 def expected(inverse, camera, *, T=T, radius=RADIUS, jump=JUMP, cos_max_angle=STEEP, least=ALL):
@@ -199,7 +197,9 @@ def test_an_edge_inside_a_quad_parts_its_pixels():
     depth[:, 33:] = 1.5
     found = make(1 / depth, camera_of(64, 48), T=np.eye(4))
     z = found.points[:, 2]
-    assert np.isclose(z, 1.0, atol=POSITION).sum() + np.isclose(z, 1.5, atol=POSITION).sum() == len(z)
+    assert np.isclose(z, 1.0, atol=POSITION).sum() + np.isclose(z, 1.5, atol=POSITION).sum() == len(
+        z
+    )
     column = found.places // 16 % 32
     assert np.isclose(z[column < 16], 1.0).all() and np.isclose(z[column > 16], 1.5).all()
     assert {15, 17, 18} <= set(column.tolist())
@@ -213,9 +213,7 @@ def test_runs_lie_side_by_side_and_hold_neighbours():
     run_of_row = np.repeat(np.arange(len(found.found)), kernels.slots_of_run())[found.filled]
     quad = found.places // 16
     runs = -(-across // quads)
-    np.testing.assert_array_equal(
-        run_of_row, quad // across * runs + quad % across // quads
-    )
+    np.testing.assert_array_equal(run_of_row, quad // across * runs + quad % across // quads)
     assert (np.diff(found.places) > 0).all() and found.found.max() <= kernels.slots_of_run()
 
 
@@ -283,7 +281,8 @@ class Cells:
             for width in (6, 3)
         )
         surface, color = (
-            kernels.Sink(grid.index, 1 / size) for grid, size in zip(self.grids, VOXELS, strict=True)
+            kernels.Sink(grid.index, 1 / size)
+            for grid, size in zip(self.grids, VOXELS, strict=True)
         )
         self.sinks = kernels.Sinks(True, surface, color)
         self.blocks = (0, 0)
@@ -311,7 +310,10 @@ def assert_sums(cells: Cells, frames: list[Found], colors: list[np.ndarray]) -> 
     counts = np.concatenate([found.counts for found in frames])
     normals = np.vstack([found.normals for found in frames])
     values = np.vstack(
-        [twin.average_color(found.places, color) for found, color in zip(frames, colors, strict=True)]
+        [
+            twin.average_color(found.places, color)
+            for found, color in zip(frames, colors, strict=True)
+        ]
     )
     for size, carried, (keys, sums), blocks in zip(
         VOXELS, (normals, values), (cells.surface, cells.colors), cells.blocks, strict=True

@@ -114,7 +114,9 @@ def test_votes_of_several_views_are_those_of_each_and_equal_their_twin(voxels, d
             pose((0.05, 0.0, -5.0)),  # sees nothing: all lies behind it
         ]
     )
-    images = np.array([depth, depth[::-1], np.roll(depth, 50, axis=1), depth, np.full_like(depth, 9)])
+    images = np.array(
+        [depth, depth[::-1], np.roll(depth, 50, axis=1), depth, np.full_like(depth, 9)]
+    )
     together, single, ranges = np.zeros((3, len(voxels), 64), np.int8)
     vote(voxels, images, poses, 1, together)
     for T, image in zip(poses, images[:4], strict=True):

@@ -120,9 +120,7 @@ def test_a_window_of_one_frame_is_integrating_its_cloud(gpis):
         color.integrate(cloud)
     assert_close(pipeline.surface, surface, RUNS)
     assert_close(pipeline.maps["color"], color, RUNS)
-    np.testing.assert_array_equal(
-        pipeline.surface.voxels().evidence, surface.voxels().evidence
-    )
+    np.testing.assert_array_equal(pipeline.surface.voxels().evidence, surface.voxels().evidence)
     assert len(surface) > 200
 
 
@@ -272,9 +270,7 @@ def test_a_window_ends_where_the_camera_has_moved_or_turned(frames, step, count)
 
 def test_a_window_ends_at_a_gap_in_the_recording(frames):
     numbered = [replace(frame, index=10 * n + 5) for n, frame in enumerate(frames[:3])]
-    after, gap = (
-        replace(frames[3], index=25 + 10 * GAP + more) for more in (0, 1)
-    )
+    after, gap = (replace(frames[3], index=25 + 10 * GAP + more) for more in (0, 1))
     every_frame = replace(CONFIG, window=8)
     assert windows([*numbered, after], every_frame) == [1, 2, 3, 4]
     assert windows([*numbered, gap], every_frame) == [1, 2, 3, 1]

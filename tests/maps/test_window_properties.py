@@ -78,7 +78,9 @@ def test_maps_of_a_group_are_as_if_each_were_alone(frames):
         other = run(frames, GROUPED, apart).maps[alone.name]
         assert_close(together.maps[alone.name], other, SAME)
     weights = {name: each.voxels().weights.sum() for name, each in together.maps.items()}
-    assert weights["green"] == weights["color"] and 0.8 < weights["patchy"] / weights["green"] < 0.95
+    assert (
+        weights["green"] == weights["color"] and 0.8 < weights["patchy"] / weights["green"] < 0.95
+    )
 
 
 def test_a_window_of_one_frame_is_integrating_its_cloud_for_a_group():
@@ -86,7 +88,9 @@ def test_a_window_of_one_frame_is_integrating_its_cloud_for_a_group():
     its pixels have no number.
     """
     frames = [seen_from(turned(n), n) for n in range(3)]
-    config = replace(SINGLE, property_map=SETTINGS, preprocess=replace(CONFIG.preprocess, patch_size=0))
+    config = replace(
+        SINGLE, property_map=SETTINGS, preprocess=replace(CONFIG.preprocess, patch_size=0)
+    )
     pipeline = run(frames, config, GREEN, PATCHY)
     maps = {name: PropertyMap(name, 1, SETTINGS) for name in ("green", "patchy")}
     for frame in frames:
