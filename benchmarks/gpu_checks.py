@@ -153,7 +153,7 @@ def build(device: str, folder: str, out: str) -> str:
     pipeline = uf.Pipeline(uf.Config(device=device))
     for depth, color, T in zip(kept["depth"], kept["color"], kept["T"], strict=True):
         pipeline.step(uf.Frame(depth, camera, color, T))
-    getattr(pipeline, "flush", lambda: None)()
+    pipeline.flush()
     Path(out).mkdir()
     for name, each in pipeline.maps.items():
         each.save(Path(out) / name)
@@ -241,10 +241,9 @@ def all_together(frames: Sequence[uf.Frame]) -> float:
     """
     config = uf.Config(properties=("infrared",))
     pipeline = uf.Pipeline(config, encoder=RandomFeatures(), synchronize=False)
-    flush = getattr(pipeline, "flush", lambda: None)
     for frame in frames[:2]:
         pipeline.step(frame)
-    flush()
+    pipeline.flush()
     total = 0.0
     for frame in frames[2:]:
         ms, step = timed(pipeline.step, frame)

@@ -91,25 +91,14 @@ def _rows(array: Any, rows: int | None) -> np.ndarray:
 
 
 def _clipping(of: Arguments) -> tuple[float, float]:
-    images = 3 if "inverse" in of else 2
-    return 4 * images * _pixels(of["depth"]), 0
+    return 4 * 3 * _pixels(of["depth"]), 0
 
 
-def _normals(of: Arguments) -> tuple[float, float]:
-    pixels, radius = _pixels(of["inverse"]), of["radius"]
-    pairs = 2 * (2 * radius + 1) * radius
-    flops = pixels * (6 * pairs / 4 + 35)
-    if "places" in of:  # points, normals, counts and places of patches
-        return pixels * (4 + 32 / 4), flops
-    return pixels * 16, flops
-
-
-def _binning(of: Arguments) -> tuple[float, float]:
-    channels = sum(of["channels"])
-    points, numbers = of["points"].shape[0], 3 + channels
-    if "found" in of:
-        points, numbers = int(_rows(of["found"], None).sum()), numbers + 1
-    return points * 4 * numbers, points * (10 + channels + 3 * of["with_positions"])
+def _patches(of: Arguments) -> tuple[float, float]:
+    pixels, pairs = _pixels(of["inverse"]), 2 * (2 * of["radius"] + 1)
+    # a quarter as many patches, which read and write a cell of the surface and one of the colours
+    moved = pixels * (4 + 3) + pixels / 4 * 2 * 8 * (7 + 4)
+    return moved, pixels * (6 * pairs / 4 + 35) + pixels / 4 * 40
 
 
 def _compacting(of: Arguments) -> tuple[float, float]:
@@ -120,9 +109,8 @@ def _compacting(of: Arguments) -> tuple[float, float]:
 
 def _encoding(of: Arguments) -> tuple[float, float]:
     layout = of["layout"]
-    begin, end = of.get("begin", 0), of["end"] if "end" in of else of["blocks"]
-    totals = of["totals"] if "totals" in of else of["rows"]
-    points = _rows(totals, end).reshape(end, -1)[begin:, -1 if "totals" in of else 1]
+    begin, end = of["begin"], of["end"]
+    points = _rows(of["rows"], end)[begin:, 1]
     masks, neighbors = _rows(of["masks"], None), _rows(of["neighbors"], end)[begin:]
     seen = _cells(masks[neighbors] & _rows(of["window"], 27))  # (B, 27) cells
     solved = points >= of["minimum"]
@@ -138,7 +126,7 @@ def _encoding(of: Arguments) -> tuple[float, float]:
 
 
 def _voting(of: Arguments) -> tuple[float, float]:
-    begin, end = of.get("begin", 0), of["end"] if "end" in of else of["voxels"]
+    begin, end = of["begin"], of["end"]
     rank, K, poses = (
         of["rank"],
         np.array(of["K"]),
@@ -159,14 +147,13 @@ def _voting(of: Arguments) -> tuple[float, float]:
     return moved + images, flops + 8.0 * rank * supported[anywhere].sum()
 
 
-FRONT = "a float in, {} out a pixel"
-NORMALS = "6 operations a pair of the window, shared by 4 pixels, and 35"
 COUNTS = {
-    "clip_depth": Count(FRONT.format("one"), _clipping),
-    "clip_and_invert": Count(FRONT.format("two"), _clipping),
-    "estimate_normals": Count(f"{FRONT.format('three')}; {NORMALS}", _normals),
-    "make_patches": Count(f"a float in a pixel, 32 bytes out a quad; {NORMALS}", _normals),
-    "bin_points": Count("points and values in; 10 operations and a sum a point", _binning),
+    "clip_and_invert": Count("a float in, two out a pixel", _clipping),
+    "make_patches": Count(
+        "a float and a colour in a pixel, a cell of each map in and out a quad; 6 operations a pair of "
+        "the window, shared by 4 pixels, 35 a pixel and 40 a quad",
+        _patches,
+    ),
     "compact_cells": Count(
         "sums of cells with points in and set to 0, their means out", _compacting
     ),

@@ -81,7 +81,7 @@ class Ours(Side):
 
     def finish(self) -> None:
         # a pipeline that fuses every frame at once has nothing to flush
-        getattr(self.pipeline, "flush", lambda: None)()
+        self.pipeline.flush()
 
     def mesh(self) -> uf.Mesh:
         return self.pipeline.extract_mesh()

@@ -237,16 +237,17 @@ def test_encoding_is_counted_as_what_every_voxel_sees(small_room):
         ours = Ours(Config())
         ours.step(small_room[0])
         ours.finish()
-    assert {"bin_points", "compact_cells", "encode_cells", "vote_cells"} <= counted.keys()
+    assert {"make_patches", "compact_cells", "encode_cells", "vote_cells"} <= counted.keys()
     assert all(moved > 0 for launches in counted.values() for moved, _ in launches)
     # of one map: 20 + 4 rows, in patches of 4 x 4
     blocks, layout = 2, Layout(20, 1)
     of = {
         "layout": layout,
-        "blocks": blocks,
+        "begin": 0,
+        "end": blocks,
         "masks": np.array([[0xFF, 0], [0, 1]], np.uint32),
         "neighbors": np.where(np.arange(27) == 13, [[0], [1]], -1),
-        "totals": np.array([8, 1]),
+        "rows": np.array([[0, 8, 1], [8, 1, 1]]),
         "minimum": 2,
         "window": window_masks(4),
     }
@@ -262,7 +263,7 @@ def test_profile_runs_the_frames_and_says_how_it_counts(small_room, monkeypatch)
     text = speed_profile.profile(list(small_room[:4]), Config(), 2)
     assert "2 frames, Pipeline.step" in text and "| vote_cells | 3.00 | 100 | 1.0 | " in text
     assert "| vote_cells | 3.00 | 100 | 1.0 | - |" not in text
-    for name in ("bin_points", "compact_cells", "encode_cells", "vote_cells"):
+    for name in ("make_patches", "compact_cells", "encode_cells", "vote_cells"):
         assert f"| {name} | {speed_profile.COUNTS[name].how} |" in text
 
 
@@ -284,7 +285,7 @@ uf.init("cpu")
 frame = SyntheticRoom(60, width=160, height=120)[0]
 uf.preprocess(frame)
 uf.preprocess(frame)
-ms, calls = speed_profile.kernel_times()["estimate_normals"]
+ms, calls = speed_profile.kernel_times()["make_patches"]
 print(calls, ms > 0)
 """
     done = subprocess.run(
