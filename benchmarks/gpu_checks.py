@@ -250,7 +250,7 @@ def all_together(frames: Sequence[uf.Frame]) -> float:
         total += ms - sum(
             spent for stage, spent in step.milliseconds.items() if stage.endswith(" image")
         )
-    return (total + timed(flush)[0]) / (len(frames) - 2)
+    return (total + timed(pipeline.flush)[0]) / (len(frames) - 2)
 
 
 def timed(work: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
