@@ -14,14 +14,15 @@ import pytest
 
 FOLDER = Path(__file__).parent
 PACKAGE = FOLDER.parents[1] / "taichi_unifusion"
-# Bookkeeping without a twin: tests in kernels/test_index.py and maps/test_meshing.py compare it
-# with a dict or a sum.
+# Bookkeeping without a twin: tests in kernels/test_index.py, kernels/test_binning.py and
+# maps/test_meshing.py compare it with a dict, a set or a sum.
 BOOKKEEPING = {
     "claim_slots",
     "find_slots",
     "release_slots",
     "count_leaves",
     "copy_rows",
+    "forget_blocks",
     "gather_rows",
 }
 
