@@ -145,6 +145,17 @@ class Pipeline:
                     done |= group.integrate(cloud)
         return done
 
+    def _flush(self) -> dict[str, float]:
+        """Fuse the frames of the last window; milliseconds by stage."""
+        clock = StageClock(self.synchronize)
+        with clock.stage("sum"):
+            self.fusion.close()
+        for piece in self.fusion.due(frames=1):
+            with clock.stage(piece.name):
+                piece.work()
+        self.flush()
+        return clock.milliseconds
+
     def flush(self) -> None:
         """Fuse the frames of the last window. Reading, saving or changing a map does so by itself."""
         self.fusion.flush()
@@ -203,7 +214,7 @@ class Pipeline:
             on_frame(i + 1, len(sequence))
             if failure:
                 break
-        self.flush()
+        log.add_flush(self._flush())
         return log.result(interrupted, failure)
 
     def extract_mesh(self, resolution: int | None = None) -> Mesh:

@@ -128,6 +128,17 @@ class RunLog:
         self.poses.append((frame.timestamp, frame.require_pose()))
         self.check_poses(frame)
 
+    def add_flush(self, milliseconds: Mapping[str, float]) -> None:
+        """Add what fusing the last window took to the last step."""
+        if self.steps:
+            last = self.steps[-1]
+            stages = dict.fromkeys((*last.milliseconds, *milliseconds))
+            total = {
+                stage: last.milliseconds.get(stage, 0.0) + milliseconds.get(stage, 0.0)
+                for stage in stages
+            }
+            self.steps[-1] = replace(last, milliseconds=total)
+
     def add_skipped(self, i: int, error: UniFusionError) -> None:
         reason = next(reason for kind, reason in SKIP_REASONS.items() if isinstance(error, kind))
         if reason not in self.reasons:

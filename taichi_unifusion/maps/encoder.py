@@ -52,13 +52,13 @@ class Encoder:
             table[:, 1:, :rank] = 0.5 * encoding.gradient(t)  # t moves by 1/2 a voxel
         return table
 
-    @compiled_sooner()
     def encode(self, binned: Binned) -> LocalLim:
         """Encode the averages in cells."""
         local = self.room(binned)
         self.encode_blocks(binned, 0, binned.count, local)
         return local
 
+    @compiled_sooner()
     def encode_blocks(self, binned: Binned, begin: int, end: int, local: LocalLim) -> None:
         """Encode the averages in cells of blocks `begin` to `end` into a local LIM."""
         binned.loan.check()

@@ -13,13 +13,13 @@ from ..kernels.layout import Layout
 from ..kernels.patches import Patches, Values
 from ..types import Frame, PointCloud
 from .base_map import BaseMap, Integration
-from .binner import Binner
+from .binner import Binner, SurfelBinner
 from .encoder import Encoder
 from .local_lim import LocalLim
 from .property_map import PropertyMap, encode_values
 from .regression_map import RegressionMap
 
-SPREAD = 3  # voxels, at most, that the samples beside a block's surfels may bring
+SPREAD = 2  # voxels that the samples beside a block's surfels may bring, the block not counted
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,8 @@ class Part:
         """
         for each in self.maps:
             own = touched if each is self.maps[0] else blocks
-            each.grid.expect(SPREAD * blocks, own)
+            spread = SPREAD if isinstance(self.binner, SurfelBinner) else 0
+            each.grid.expect((1 + spread) * blocks, spread * blocks, own)
 
     def fuse(self, local: LocalLim) -> dict[str, int]:
         """Fuse to each map its part; by name how many voxels that were."""

@@ -115,6 +115,7 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         T_camera_world = np.ascontiguousarray(view.T_camera_cloud[None, :3], dtype=np.float32)
         self.vote(view.values[None], view.camera, T_camera_world, (0, grid.count), sign)
 
+    @runtime.compiled_sooner()
     def vote(
         self,
         depth: DeviceArray,

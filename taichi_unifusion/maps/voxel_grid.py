@@ -206,11 +206,11 @@ class VoxelGrid:
         self.note_touched(extra)
         self._make_room(extra)
 
-    def expect(self, extra: int, touched: int) -> None:
-        """Make room for `extra` more voxels that come later, of which `touched` were touched now;
-        raises as `reserve`.
+    def expect(self, extra: int, untouched: int, touched: int) -> None:
+        """Make room for `extra` more voxels that come later: `touched` of them were touched now,
+        `untouched` will be only then; raises as `reserve`.
         """
-        self.note_touched(touched, spare=extra)
+        self.note_touched(touched, spare=untouched)
         self._make_room(extra)
 
     def _make_room(self, extra: int) -> None:

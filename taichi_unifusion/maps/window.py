@@ -31,7 +31,7 @@ from .surface_map import SurfaceMap
 
 # A window ends where the camera has moved this far from its first frame [m, degrees]: from there
 # fewer voxels are shared, and a window that a loop moves would bend.
-FARTHEST_MOVE, LARGEST_TURN = 0.3, 15.0
+FARTHEST_MOVE, LARGEST_TURN = 0.6, 30.0
 GAP = 3  # a step between frames that is so many times the usual one ends a window
 ROOM = 256 << 20  # bytes of a part's sums, or of depth images, beyond which a window ends
 VOTE_PIECES = 20
@@ -290,9 +290,11 @@ class WindowFusion:
             self.window = None
             self._images.reverse()
 
-    def due(self) -> Iterator[Piece]:
-        """The pieces to do now, so that all are done when the next window is full."""
-        frames_left = self.size - len(self.window) if self.window else self.size
+    def due(self, frames: int = 0) -> Iterator[Piece]:
+        """The pieces to do now, so that all are done when the next window is full, or in so many
+        frames.
+        """
+        frames_left = frames or self.size - (len(self.window) if self.window else 0)
         for _ in range(-(-len(self.pieces) // max(frames_left, 1))):
             yield self.pieces.popleft()
         self._release()
