@@ -268,8 +268,10 @@ def test_the_metrics_agree_with_the_files(made):
         "load",
         "preprocess",
         "sum",
+        "surface",
+        "color",
         "frame",
-    ]  # all of it is in one window, which is fused after the last frame
+    ]  # all of it is in one window, which is fused after the last frame, as a part of it
     assert all(
         value["median"] > 0 and value["mean"] > 0
         for stage, value in metrics["milliseconds"].items()
