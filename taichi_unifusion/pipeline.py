@@ -153,7 +153,6 @@ class Pipeline:
         for piece in self.fusion.due(frames=1):
             with clock.stage(piece.name):
                 piece.work()
-        self.flush()
         return clock.milliseconds
 
     def flush(self) -> None:

@@ -191,6 +191,44 @@ def claim_block(
 
 
 @ti.func
+def enter_voxel(
+    # in:
+    ijk: ti.template(),
+    which: ti.template(),
+    now: ti.template(),
+    index: ti.template(),
+    # in and out:
+    totals: ti.template(),
+    keys: ti.template(),
+    sums: ti.template(),
+) -> ti.i32:
+    """The block of voxel ijk in the cells of map `which` of 2, 3, marked as seen by the frame."""
+    room = sums.shape[0]
+    block = claim_block(ijk, now[which], which, now[which + 2], index, room, totals, keys)
+    if block < room:
+        mark_frame(block, 1 << now[1], now[0], keys)
+    return block
+
+
+@ti.func
+def end_run(
+    # in:
+    width: ti.template(),
+    which: ti.template(),
+    block: ti.i32,
+    place: ti.template(),
+    run: ti.i32,
+    total: ti.template(),
+    now: ti.template(),
+    # in and out:
+    sums: ti.template(),
+):
+    """Add the sums over a run of patches in a cell, if blocks from this one on are added to."""
+    if run > 0 and block >= now[which + 2]:
+        add_run(width, block, place, run, total, now[0], sums)
+
+
+@ti.func
 def patch_color(color: ti.template(), row: ti.i32, column: ti.i32, mask: ti.i32, count: ti.i32):
     """Mean colour, in [0, 1], of the pixels of a quad whose bits are in `mask`."""
     total = ti.Vector([0, 0, 0])
@@ -226,7 +264,6 @@ def make_patches(
     across = (width + 1) // 2
     runs = (across + quads - 1) // quads
     jump, cos_max_angle, least = rules[0], rules[1], rules[2]
-    sign, frame = now[0], 1 << now[1]
     stride = ti.static(small_stride())
     for i in range((height + 1) // 2 * runs * stride):
         if i % stride == 0:
@@ -239,12 +276,8 @@ def make_patches(
             block_s, block_c, run_s, run_c = 0, 0, 0, 0
             total_s, total_c = ti.Vector([0.0] * 6), ti.Vector([0.0] * 3)
             for column in range(start, ti.min(start + quads, across)):
-                of, slope_u, slope_v, known = (
-                    0.0,
-                    0.0,
-                    0.0,
-                    False,
-                )  # slopes of a surface, and its depth
+                # slopes of a surface, and its inverse depth
+                slope_u, slope_v, of, known = 0.0, 0.0, 0.0, False
                 count, mask = 0, 0
                 normal, x = ti.Vector([0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0, 0.0])
                 for p in range(QUAD + 1):  # the last round is for what is left
@@ -268,21 +301,17 @@ def make_patches(
                                 y = x * ti.static(sinks.surface.per_meter * CELLS)
                                 at = ti.floor(y, ti.i32)
                                 if any(at != place_s):
-                                    if run_s > 0 and block_s >= now[4]:
-                                        add_run(6, block_s, place_s, run_s, total_s, sign, sums_s)
+                                    end_run(6, 2, block_s, place_s, run_s, total_s, now, sums_s)
                                     if any((at >> 2) != (place_s >> 2)):
-                                        block_s = claim_block(
+                                        block_s = enter_voxel(
                                             at >> 2,
-                                            now[2],
                                             2,
-                                            now[4],
+                                            now,
                                             sinks.surface.index,
-                                            sums_s.shape[0],
                                             totals,
                                             keys_s,
+                                            sums_s,
                                         )
-                                        if block_s < sums_s.shape[0]:
-                                            mark_frame(block_s, frame, sign, keys_s)
                                     place_s = at
                                     run_s = 0
                                     total_s.fill(0.0)
@@ -294,21 +323,17 @@ def make_patches(
                             if ti.static(sinks.has_color):
                                 at = ti.floor(x * ti.static(sinks.color.per_meter * CELLS), ti.i32)
                                 if any(at != place_c):
-                                    if run_c > 0 and block_c >= now[5]:
-                                        add_run(3, block_c, place_c, run_c, total_c, sign, sums_c)
+                                    end_run(3, 3, block_c, place_c, run_c, total_c, now, sums_c)
                                     if any((at >> 2) != (place_c >> 2)):
-                                        block_c = claim_block(
+                                        block_c = enter_voxel(
                                             at >> 2,
-                                            now[3],
                                             3,
-                                            now[5],
+                                            now,
                                             sinks.color.index,
-                                            sums_c.shape[0],
                                             totals,
                                             keys_c,
+                                            sums_c,
                                         )
-                                        if block_c < sums_c.shape[0]:
-                                            mark_frame(block_c, frame, sign, keys_c)
                                     place_c = at
                                     run_c = 0
                                     total_c.fill(0.0)
@@ -341,11 +366,9 @@ def make_patches(
                             mask |= 1 << p
                             x += lift(u, v, 1.0 / q, K)
             if ti.static(sinks.has_surface):
-                if run_s > 0 and block_s >= now[4]:
-                    add_run(6, block_s, place_s, run_s, total_s, sign, sums_s)
+                end_run(6, 2, block_s, place_s, run_s, total_s, now, sums_s)
             if ti.static(sinks.has_color):
-                if run_c > 0 and block_c >= now[5]:
-                    add_run(3, block_c, place_c, run_c, total_c, sign, sums_c)
+                end_run(3, 3, block_c, place_c, run_c, total_c, now, sums_c)
             if ti.static(sinks.write):
                 patches.found[part] = n - part * ti.static(slots_of_run())
             ti.atomic_add(totals[0], n - part * ti.static(slots_of_run()))
@@ -366,15 +389,11 @@ def average_color(
         first = part * ti.static(slots_of_run())
         for n in range(first, first + found[part]):
             row, column = (places[n] >> 4) // across * 2, (places[n] >> 4) % across * 2
-            total, count = ti.Vector([0, 0, 0]), 0
-            for p in range(QUAD):
-                if (places[n] >> p) & 1 != 0:
-                    count += 1
-                    for c in ti.static(range(3)):
-                        total[c] += ti.cast(color[row + p // 2, column + p % 2, c], ti.i32)
-            scale = 1.0 / (255.0 * ti.cast(count, ti.f32))
+            mask = places[n] & 15
+            count = ti.cast(ti.math.popcnt(ti.cast(mask, ti.u32)), ti.i32)
+            mean = patch_color(color, row, column, mask, count)
             for c in ti.static(range(3)):
-                values[n, c] = ti.cast(total[c], ti.f32) * scale
+                values[n, c] = mean[c]
 
 
 @ti.kernel

@@ -193,9 +193,8 @@ class Binner:
         def borrow(name: str, dtype: Any, *row: int) -> DeviceArray:
             return arena.borrow(name, dtype, (max(n, FIRST_BLOCKS), *row))
 
-        keys = borrow(
-            "keys", ti.i32, KEY_COLUMNS
-        )  # a copy: the next window begins before this one is fused
+        # a copy: the next window begins before this one is fused
+        keys = borrow("keys", ti.i32, KEY_COLUMNS)
         copy_rows(n, arrays.keys, keys)
         masks, support = borrow("masks", ti.u32, 2), borrow("support", ti.u32, 2)
         neighbors, rows = borrow("neighbors", ti.i32, 27), np.empty((n, 3), np.int32)
