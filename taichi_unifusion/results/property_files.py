@@ -36,7 +36,7 @@ def property_meshes(folder: RunFolder, mesh: Mesh) -> dict[Path, Mesh]:
     """Mesh files of single properties that a results folder holds, and `mesh` in their colours, as
     its record tells them.
     """
-    looks = _recorded_looks(folder)
+    looks = recorded_looks(folder)
     return {
         file: property_mesh(mesh, name, looks.get(name, Look(range=None)))
         for name in mesh.attributes
@@ -53,7 +53,7 @@ def redraw_property_pictures(
     folder = writer.folder
     pictures = {name: folder.property_picture(name) for name in mesh.attributes if name != "color"}
     pictures = {name: picture for name, picture in pictures.items() if picture.exists()}
-    looks = _recorded_looks(folder) if pictures else {}
+    looks = recorded_looks(folder) if pictures else {}
     for name, picture in pictures.items():
         look = looks.get(name, Look(range=None))
         shown = property_mesh(mesh, name, look)
@@ -66,7 +66,7 @@ def redraw_property_pictures(
             )
 
 
-def _recorded_looks(folder: RunFolder) -> Mapping[str, Look]:
+def recorded_looks(folder: RunFolder) -> Mapping[str, Look]:
     """How each property was coloured; empty where the folder has no record that can be read."""
     try:
         record = read_record(folder.record)

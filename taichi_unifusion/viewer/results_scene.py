@@ -1,0 +1,263 @@
+"""Results folder, or mesh file -> Scene: the mesh with every layer that its files hold, and the
+cameras. No kernel runs.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, InputError, UniFusionError
+from ..files.atomic import read_bytes
+from ..files.maps import read_map
+from ..files.mesh_reading import read_any_mesh, read_mesh
+from ..files.trajectories import read_trajectory
+from ..geometry.triangles import SurfaceDistance
+from ..rendering.look import Look
+from ..rendering.mesh_checks import check_mesh
+from ..results.property_files import recorded_looks
+from ..results.reader import Run, read_run
+from ..results.run_folder import RunFolder
+from ..types import Mesh, PinholeCamera
+from .answers import relevance_layer
+from .scene import Layer, Scene, SceneCamera, SceneMesh
+
+logger = logging.getLogger(__name__)
+
+CELLS = 4  # of a voxel along an edge, in which evidence is counted
+COLOR, NORMALS, HEIGHT = "color", "normals", "height"
+GREY = 200  # of a mesh that has no colours
+# where the recording cannot be asked: a camera of 60 degrees, to draw its outline
+SOME_CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """What to put into a scene beside what a results folder holds."""
+
+    compare: Path | None = None  # a mesh in the same world, to which distances are shown
+    cameras: int = 60  # at most so many, evenly over the trajectory
+    images: bool = False  # load what those cameras saw, where the recording is still there
+    image_width: int = 320  # [pixels]
+
+
+def open_scene(path: str | Path, options: SceneOptions | None = None) -> Scene:
+    """The scene of a results folder, or of a mesh file; raises FileError where there is no mesh, or
+    InputError where it is empty. What else is missing or damaged is left out, with a warning.
+    """
+    path, options = Path(path), options or SceneOptions()
+    if not path.exists():
+        raise FileError(f"{path}: no such file or folder")
+    folder = RunFolder(path) if path.is_dir() else None
+    if folder is not None and not folder.mesh.exists():
+        raise FileError(
+            f"{folder.mesh}: no such file; give a results folder, or make its mesh with: unifusion mesh {path}"
+        )
+    source = path if folder is None else folder.mesh
+    mesh = check_mesh(read_any_mesh(source), str(source))
+    T_up_world = np.eye(4) if folder is None else up_of(folder)
+    looks = {} if folder is None else recorded_looks(folder)
+    bare = Scene(path.name or str(path), (), T_up_world=T_up_world)
+    layers = list(_own_layers(mesh, looks))
+    layers += shape_layers(mesh, bare)
+    if folder is not None:
+        layers += _map_layers(mesh, folder)
+        layers += _answer_layers(mesh, folder)
+    if options.compare is not None:
+        layers.append(distance_layer(mesh, options.compare))
+    shown = SceneMesh(bare.name, mesh, tuple(layers))
+    cameras = () if folder is None else _cameras(folder, options)
+    return replace(bare, meshes=(shown,), cameras=cameras)
+
+
+def up_of(folder: RunFolder) -> NDArray[np.float64]:
+    """T_up_world (4, 4) of a results folder; the identity where it does not say."""
+    return np.eye(4)
+
+
+def _own_layers(mesh: Mesh, looks: Mapping[str, Look]) -> Iterator[Layer]:
+    """Colour, and every property that the mesh carries."""
+    color = mesh.attributes.get(COLOR)
+    if color is not None and color.shape[1] == 3:
+        yield Layer(COLOR, (255 * np.clip(np.nan_to_num(color), 0, 1) + 0.5).astype(np.uint8))
+    else:
+        yield Layer(COLOR, np.full((len(mesh.vertices), 3), GREY, np.uint8))
+    for name, values in mesh.attributes.items():
+        if name != COLOR and values.shape[1] in (1, 3):
+            yield Layer.of_values(name, values, looks.get(name, Look(range=None)))
+
+
+def shape_layers(mesh: Mesh, scene: Scene) -> list[Layer]:
+    """Normals and heights, seen in the upright frame of the scene."""
+    normals = SceneMesh("", mesh, (_blank(mesh),)).normals @ scene.T_up_world[:3, :3].T
+    look = Look(range=(-1.0, 1.0), label="normal in x, y and up")
+    heights = scene.heights_of(mesh.vertices)
+    return [
+        Layer.of_values(NORMALS, normals, look),
+        Layer.of_values(HEIGHT, heights, Look("viridis", None, "height [m]")),
+    ]
+
+
+def _blank(mesh: Mesh) -> Layer:
+    return Layer("", np.zeros((len(mesh.vertices), 3), np.uint8))
+
+
+def _map_layers(mesh: Mesh, folder: RunFolder) -> list[Layer]:
+    """Weight and evidence of the surface map at the vertices, from the voxel and the cell that a
+    vertex lies in.
+    """
+    file = folder.maps.get("surface")
+    if file is None:
+        return []
+    try:
+        tensors, manifest = read_map(file)
+        size = float(manifest["settings"]["voxel_size"])
+        keys, weights = tensors["keys"], tensors["weights"]
+    except (UniFusionError, KeyError, TypeError, ValueError) as error:
+        logger.warning("%s: no weights to show (%s)", file, error)
+        return []
+    row = _rows_of(keys, np.floor(mesh.vertices / size).astype(np.int64))
+    weight = _known(weights, row)
+    layers = [Layer.of_values("weight", weight, Look("magma", None, "weight of the voxel"))]
+    if "evidence" in tensors:
+        cells = np.floor(mesh.vertices * (CELLS / size)).astype(np.int64) % CELLS
+        cell = (cells[:, 0] * CELLS + cells[:, 1]) * CELLS + cells[:, 2]
+        votes = tensors["evidence"][np.maximum(row, 0), cell].astype(np.float32)
+        votes[row < 0] = np.nan
+        look = Look("diverging", None, "evidence: views that saw it less those that saw through it")
+        layers.append(Layer.of_values("evidence", votes, look))
+    return layers
+
+
+def _rows_of(keys: NDArray, wanted: NDArray) -> NDArray[np.int64]:
+    """Rows of `keys` (N, 3) that equal the `wanted` (M, 3), -1 where there is none."""
+    low = np.minimum(keys.min(axis=0), wanted.min(axis=0))
+    span = np.maximum(keys.max(axis=0), wanted.max(axis=0)) - low + 1
+    order = np.array([span[1] * span[2], span[2], 1], np.int64)
+    codes, asked = (keys - low) @ order, (wanted - low) @ order
+    sorting = np.argsort(codes, kind="stable")
+    place = np.minimum(np.searchsorted(codes, asked, sorter=sorting), len(codes) - 1)
+    row = sorting[place]
+    return np.where(codes[row] == asked, row, -1)
+
+
+def _known(values: NDArray, row: NDArray) -> NDArray[np.float32]:
+    return np.where(row >= 0, values[np.maximum(row, 0)], np.nan).astype(np.float32)
+
+
+def _answer_layers(mesh: Mesh, folder: RunFolder) -> list[Layer]:
+    """Answers and segmentation that lie in the folder, where they are of this very mesh."""
+    layers: list[Layer] = []
+    for entry in _read_json(folder.answers) or []:
+        try:
+            text, answer = (
+                str(entry["text"]),
+                _same_mesh(mesh, folder.path / Path(entry["mesh"]).name),
+            )
+        except (TypeError, KeyError):
+            continue
+        if answer is not None and "relevance" in answer.attributes:
+            layers.append(relevance_layer(mesh, text, answer.attributes["relevance"][:, 0]))
+    listed = _read_json(folder.segmentation) or {}
+    segmented = _same_mesh(mesh, folder.segmentation_mesh) if listed else None
+    if segmented is not None and "label" in segmented.attributes:
+        classes = {int(each["label"]): each for each in listed.get("labels", ())}
+        numbers = np.array(sorted(classes))
+        label = segmented.attributes["label"][:, 0].astype(int)
+        rows = np.searchsorted(numbers, label).clip(0, len(numbers) - 1)
+        rows = np.where(numbers[rows] == label, rows, -1)
+        names = [classes[number]["name"] for number in numbers]
+        colors = np.array([classes[number]["color"] for number in numbers], np.uint8)
+        layers.append(Layer.of_labels("segmentation", rows, names, colors))
+    return layers
+
+
+def _read_json(file: Path):
+    """The JSON values of a file, None where it is missing or damaged."""
+    if not file.exists():
+        return None
+    try:
+        return json.loads(read_bytes(file))
+    except (FileError, ValueError) as error:
+        logger.warning("%s: cannot be read (%s)", file, error)
+        return None
+
+
+def _same_mesh(mesh: Mesh, file: Path) -> Mesh | None:
+    """The mesh in a file, if its vertices are those of `mesh`."""
+    if not file.exists():
+        return None
+    try:
+        other = read_mesh(file)
+    except UniFusionError as error:
+        logger.warning("%s", error)
+        return None
+    if not np.array_equal(other.vertices, mesh.vertices):
+        logger.warning("%s: is of another mesh than the folder's now; ask again to see it", file)
+        return None
+    return other
+
+
+def distance_layer(mesh: Mesh, other: Path) -> Layer:
+    """Distance [m] of every vertex to the surface of another mesh, which is in the same world."""
+    truth = check_mesh(read_any_mesh(other), str(other))
+    distances = SurfaceDistance(truth.vertices, truth.faces)(mesh.vertices)
+    look = Look("inferno", None, f"distance to {other.name} [m]")
+    return Layer.of_values(f"distance to {other.name}", distances, look)
+
+
+def _cameras(folder: RunFolder, options: SceneOptions) -> tuple[SceneCamera, ...]:
+    """Cameras of the trajectory, evenly over it."""
+    if not folder.trajectory.exists() or options.cameras < 1:
+        return ()
+    try:
+        poses = read_trajectory(folder.trajectory)
+    except UniFusionError as error:
+        logger.warning("%s", error)
+        return ()
+    run = find_recorded_run(folder)
+    numbers = range(len(poses)) if run is None or len(run.used) != len(poses) else run.used
+    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), options.cameras)).astype(int))
+    camera = SOME_CAMERA if run is None else _camera_of(run)
+    cameras = []
+    for place in chosen:
+        pose, number = poses.T_world_camera[place], int(numbers[place])
+        image = camera_image(run, number, options.image_width) if run and options.images else None
+        cameras.append(SceneCamera(f"frame {number}", camera, pose, image))
+    return tuple(cameras)
+
+
+def find_recorded_run(folder: RunFolder) -> Run | None:
+    """The run of a folder that says which recording it was made from, else None."""
+    try:
+        return read_run(folder.path)
+    except (FileError, InputError):
+        return None
+
+
+def _camera_of(run: Run) -> PinholeCamera:
+    """The camera of the recording; one that is usual where that is gone."""
+    try:
+        return run.recording[run.used[0]].camera
+    except (UniFusionError, IndexError):
+        return SOME_CAMERA
+
+
+def camera_image(run: Run, index: int, width: int) -> NDArray[np.uint8] | None:
+    """The colour image (h, w, 3) RGB of a frame, at most `width` wide; None where there is none."""
+    try:
+        color = run.recording[index].color
+    except (UniFusionError, IndexError):
+        return None
+    if color is None or color.shape[1] <= width:
+        return color
+    height = max(1, round(color.shape[0] * width / color.shape[1]))
+    small = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)

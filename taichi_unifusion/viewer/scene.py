@@ -1,0 +1,318 @@
+"""Scene: what there is to see, as frozen values that know no back end.
+
+Frames of reference: *scene* is what the arrays here are in; `up` is a frame whose z points away
+from gravity. A mesh that stands elsewhere than in its own world says by how much (`offset`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..geometry.triangles import vertex_normals
+from ..rendering.look import Look, color_table, colorize, shown_range
+from ..types import Mesh, PinholeCamera, check_rigid
+
+UNKNOWN = (120, 120, 125)  # RGB of a vertex that has no value
+OUTLIERS = 0.5  # percent of the vertices at either end that do not count for the size of a scene
+APART = 0.15  # of the width of a result: the gap to the next one beside it
+
+
+@dataclass(frozen=True)
+class Legend:
+    """What the colours of a layer mean."""
+
+    label: str  # what the values are, with their unit in brackets
+    # RGB sRGB: evenly from `low` to `high`, (256, 3); of each of `names`, (n, 3); none, (0, 3), where
+    # three channels of values are red, green and blue themselves
+    colors: NDArray[np.uint8]
+    low: float = 0.0
+    high: float = 1.0
+    names: tuple[str, ...] = ()  # of classes
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One way to colour a mesh: a colour a vertex, and the values that it stands for."""
+
+    name: str
+    colors: NDArray[np.uint8]  # (V, 3) RGB sRGB
+    values: NDArray[np.float32] | None = None  # (V, c), NaN where unknown; None: the colours
+    legend: Legend | None = None
+
+    def __post_init__(self) -> None:
+        if self.colors.ndim != 2 or self.colors.shape[1] != 3 or self.colors.dtype != np.uint8:
+            raise InputError(
+                f"layer '{self.name}': colours must be (V, 3) uint8, got {self.colors.shape} {self.colors.dtype}"
+            )
+        if self.values is not None and (
+            self.values.ndim != 2 or len(self.values) != len(self.colors)
+        ):
+            raise InputError(
+                f"layer '{self.name}': values must be ({len(self.colors)}, c), got {self.values.shape}"
+            )
+
+    @classmethod
+    def of_values(cls, name: str, values: NDArray, look: Look) -> Layer:
+        """Values (V,) or (V, c) in the colours of `look`: by the colour map for one channel, as RGB
+        for three. Raises InputError for another number of channels.
+        """
+        values = np.asarray(values, np.float32)
+        values = values[:, None] if values.ndim == 1 else values
+        channels = values.shape[1]
+        if channels not in (1, 3):
+            raise InputError(f"layer '{name}': {channels} channels have no colours, 1 and 3 have")
+        low, high = shown_range(values, look)
+        colors = _bytes(colorize(values, look.colormap, low, high))
+        colors[~np.isfinite(values).all(axis=1)] = UNKNOWN
+        label = look.label or name
+        if channels == 3:
+            legend = Legend(f"{label}: red, green and blue", np.zeros((0, 3), np.uint8), low, high)
+        else:
+            legend = Legend(label, _bytes(color_table(look.colormap)), low, high)
+        return cls(name, colors, values, legend)
+
+    @classmethod
+    def of_labels(
+        cls,
+        name: str,
+        labels: NDArray[np.integer],
+        names: Sequence[str],
+        colors: NDArray[np.uint8],
+    ) -> Layer:
+        """Classes (V,), rows of `names` and `colors` (n, 3), -1 for none; the legend holds those
+        that occur, the commonest first.
+        """
+        known = (labels >= 0) & (labels < len(names))
+        shown = np.tile(np.array(UNKNOWN, np.uint8), (len(labels), 1))
+        shown[known] = colors[labels[known]]
+        counts = np.bincount(labels[known], minlength=len(names))
+        present = [i for i in np.argsort(-counts, kind="stable") if counts[i]]
+        legend = Legend(name, colors[present], names=tuple(str(names[i]) for i in present))
+        values = np.where(known, labels, np.nan).astype(np.float32)
+        return cls(name, shown, values[:, None], legend)
+
+    def take(self, rows: NDArray) -> Layer:
+        """The layer of the vertices at `rows`, indices or a mask."""
+        values = None if self.values is None else self.values[rows]
+        return replace(self, colors=self.colors[rows], values=values)
+
+    def describe(self, values: NDArray) -> str:
+        """Values (c,) of this layer at a point, in words: 0.73, (0.1, 0.2, 0.3), the name of a
+        class, "unknown".
+        """
+        values = np.asarray(values, np.float64)
+        if not np.isfinite(values).all():
+            return "unknown"
+        numbers = ", ".join(f"{value:.3g}" for value in values)
+        return numbers if len(values) == 1 else f"({numbers})"
+
+
+@dataclass(frozen=True)
+class SceneMesh:
+    """A surface with everything that can be shown on it."""
+
+    name: str
+    mesh: Mesh  # scene [m]; its attributes are not looked at
+    layers: tuple[Layer, ...]  # at least one; the first is shown first
+    note: str = ""  # what was done to it, for whoever looks at it
+    # (3,) [m] the mesh's own world + offset = scene: results may stand side by side
+    offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        if not self.layers:
+            raise InputError(f"{self.name}: a mesh in a scene needs a layer")
+        for layer in self.layers:
+            if len(layer.colors) != len(self.mesh.vertices):
+                raise InputError(
+                    f"{self.name}: {len(self.mesh.vertices)} vertices but layer '{layer.name}' has "
+                    f"{len(layer.colors)}"
+                )
+
+    def layer(self, name: str) -> Layer:
+        """The layer of that name, else the first one."""
+        return next((layer for layer in self.layers if layer.name == name), self.layers[0])
+
+    def with_layers(self, layers: Iterable[Layer]) -> SceneMesh:
+        """A copy with further layers, in place of those of the same names."""
+        named = {layer.name: layer for layer in (*self.layers, *layers)}
+        return replace(self, layers=tuple(named.values()))
+
+    def colored(self, name: str) -> Mesh:
+        """The mesh with the colours of a layer as its attribute "color", RGB in [0, 1]."""
+        bare = Mesh(self.mesh.vertices, self.mesh.faces, self.normals)
+        return bare.with_attribute("color", self.layer(name).colors / 255)
+
+    @property
+    def normals(self) -> NDArray[np.float32]:
+        """(V, 3) unit, into free space."""
+        if self.mesh.normals is not None:
+            return self.mesh.normals
+        return vertex_normals(self.mesh.vertices, self.mesh.faces)
+
+    def moved(self, by: NDArray) -> SceneMesh:
+        """The same mesh elsewhere in the scene, (3,) [m]."""
+        vertices = (self.mesh.vertices + by).astype(np.float32)
+        return replace(
+            self, mesh=replace(self.mesh, vertices=vertices), offset=self.offset + np.asarray(by)
+        )
+
+    def part(self, inside: NDArray[np.bool_]) -> SceneMesh:
+        """The triangles of which all corners are `inside` (V,), with their vertices."""
+        faces = self.mesh.faces[inside[self.mesh.faces].all(axis=1)]
+        rows, faces = np.unique(faces, return_inverse=True)
+        old = self.mesh
+        mesh = Mesh(
+            old.vertices[rows],
+            faces.reshape(-1, 3).astype(np.int32),
+            None if old.normals is None else old.normals[rows],
+            {name: values[rows] for name, values in old.attributes.items()},
+        )
+        return replace(self, mesh=mesh, layers=tuple(each.take(rows) for each in self.layers))
+
+
+@dataclass(frozen=True)
+class SceneCamera:
+    """Where a picture was taken from, and the picture."""
+
+    name: str
+    camera: PinholeCamera
+    T_world_camera: NDArray[np.float64]  # (4, 4), of the scene
+    image: NDArray[np.uint8] | None = None  # (h, w, 3) RGB, of any size
+
+    def moved(self, by: NDArray) -> SceneCamera:
+        """The same camera elsewhere in the scene, (3,) [m]."""
+        T = self.T_world_camera.copy()
+        T[:3, 3] += by
+        return replace(self, T_world_camera=T)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box along the axes of the scene."""
+
+    name: str
+    corners: NDArray[np.float64]  # (2, 3) [m] lowest and highest
+    color: tuple[int, int, int] = (255, 210, 60)
+
+
+@dataclass(frozen=True)
+class Label:
+    """A text at a point."""
+
+    text: str
+    position: NDArray[np.float64]  # (3,) [m]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What there is to see."""
+
+    name: str
+    meshes: tuple[SceneMesh, ...]
+    cameras: tuple[SceneCamera, ...] = ()
+    boxes: tuple[Box, ...] = ()
+    labels: tuple[Label, ...] = ()
+    # (4, 4) to a frame whose z points up and whose floor, where one is known, is z = 0
+    T_up_world: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_up_world", check_rigid(self.T_up_world, "T_up_world"))
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """(3,) unit, away from gravity, in the scene."""
+        return self.T_up_world[2, :3].copy()
+
+    @property
+    def layer_names(self) -> tuple[str, ...]:
+        """The layers of all meshes, in their order, each name once."""
+        return tuple(dict.fromkeys(layer.name for mesh in self.meshes for layer in mesh.layers))
+
+    @property
+    def triangles(self) -> int:
+        """How many triangles there are in all meshes."""
+        return sum(len(mesh.mesh.faces) for mesh in self.meshes)
+
+    def bounds(self) -> NDArray[np.float64]:
+        """(2, 3) lowest and highest corner [m] of the meshes, a few stray vertices left out; around
+        the origin where there are none.
+        """
+        points = [mesh.mesh.vertices for mesh in self.meshes if len(mesh.mesh.vertices)]
+        if not points:
+            return np.array([[-1.0, -1, -1], [1, 1, 1]])
+        ends = [np.percentile(each, (OUTLIERS, 100 - OUTLIERS), axis=0) for each in points]
+        return np.stack(
+            [np.min([low for low, _ in ends], axis=0), np.max([high for _, high in ends], axis=0)]
+        ).astype(np.float64)
+
+    def heights(self) -> tuple[float, float]:
+        """The lowest and highest place [m] along `up`, measured from the floor z = 0 of T_up_world."""
+        heights = [self.heights_of(mesh.mesh.vertices) for mesh in self.meshes]
+        heights = [each for each in heights if len(each)]
+        if not heights:
+            return 0.0, 1.0
+        return float(min(map(np.min, heights))), float(max(map(np.max, heights)))
+
+    def heights_of(self, points: NDArray) -> NDArray[np.float64]:
+        """Heights (N,) [m] of points (N, 3) of the scene above the floor z = 0 of T_up_world."""
+        return np.asarray(points, np.float64) @ self.T_up_world[2, :3] + self.T_up_world[2, 3]
+
+    def overview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where to look from, (3,) [m], and at what, to see everything from above and aside."""
+        low, high = self.bounds()
+        center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        side = np.cross(self.up, np.eye(3)[np.abs(self.up).argmin()])
+        side /= np.linalg.norm(side)
+        towards = 0.62 * side + 0.42 * np.cross(self.up, side) + 0.66 * self.up
+        return center + 2.1 * max(radius, 0.1) * towards / np.linalg.norm(towards), center
+
+
+def beside(scenes: Sequence[Scene]) -> Scene:
+    """Several scenes in one, from left to right; boxes and labels move along with their meshes."""
+    placed, place = [], 0.0
+    right = _right_of(scenes[0])
+    for scene in scenes:
+        corners = np.array(np.meshgrid(*scene.bounds().T)).reshape(3, -1).T @ right
+        low, high = float(corners.min()), float(corners.max())
+        by = (place - low) * right if placed else np.zeros(3)
+        place = (high if not placed else place + high - low) + APART * (high - low)
+        placed.append(_moved(scene, by))
+    return overlaid(placed)
+
+
+def overlaid(scenes: Sequence[Scene]) -> Scene:
+    """Several scenes in one, each where it is; up is that of the first."""
+    return Scene(
+        ", ".join(scene.name for scene in scenes),
+        tuple(mesh for scene in scenes for mesh in scene.meshes),
+        tuple(camera for scene in scenes for camera in scene.cameras),
+        tuple(box for scene in scenes for box in scene.boxes),
+        tuple(label for scene in scenes for label in scene.labels),
+        scenes[0].T_up_world,
+    )
+
+
+def _right_of(scene: Scene) -> NDArray[np.float64]:
+    """(3,) unit, level: to the right of whoever looks by `overview`."""
+    eye, center = scene.overview()
+    right = np.cross(center - eye, scene.up)
+    return right / np.linalg.norm(right)
+
+
+def _moved(scene: Scene, by: NDArray) -> Scene:
+    return replace(
+        scene,
+        meshes=tuple(mesh.moved(by) for mesh in scene.meshes),
+        cameras=tuple(camera.moved(by) for camera in scene.cameras),
+        boxes=tuple(replace(box, corners=box.corners + by) for box in scene.boxes),
+        labels=tuple(replace(label, position=label.position + by) for label in scene.labels),
+    )
+
+
+def _bytes(colors: NDArray) -> NDArray[np.uint8]:
+    return (255 * np.clip(colors, 0, 1) + 0.5).astype(np.uint8)

@@ -1,0 +1,192 @@
+"""Scenes: what a results folder gives to see, layers as colours and values, up, and several side by
+side.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from meshes import box, rectangle
+
+from taichi_unifusion import Mesh
+from taichi_unifusion.cli import main as cli
+from taichi_unifusion.errors import FileError, InputError
+from taichi_unifusion.files.mesh_reading import read_mesh
+from taichi_unifusion.files.meshes import write_mesh
+from taichi_unifusion.maps import SurfaceMap
+from taichi_unifusion.rendering.look import Look
+from taichi_unifusion.viewer.results_scene import SceneOptions, open_scene
+from taichi_unifusion.viewer.scene import Layer, Scene, SceneMesh, beside, overlaid
+
+EIGHT_BITS = 0.5 / 255 + 1e-6
+EXACT = 1e-5  # [m] of float32 coordinates of a room
+ZERO, ONE = (0.0,) * 3, (1.0,) * 3
+
+
+@pytest.fixture(scope="module")
+def scene(results) -> Scene:
+    return open_scene(results.path)
+
+
+def plain(mesh: Mesh, name: str = "thing") -> SceneMesh:
+    return SceneMesh(name, mesh, (Layer("color", np.full((len(mesh.vertices), 3), 7, np.uint8)),))
+
+
+def test_a_results_folder_gives_every_layer_that_it_holds(scene, results):
+    names = ("color", "saliency", "normals", "height", "weight", "evidence")
+    assert scene.layer_names == names
+    mesh = read_mesh(results.path / "mesh.ply")
+    shown = scene.meshes[0]
+    assert np.array_equal(shown.mesh.vertices, mesh.vertices)
+    color = shown.layer("color")
+    assert np.abs(color.colors / 255 - mesh.attributes["color"]).max() <= EIGHT_BITS
+    assert np.array_equal(shown.layer("saliency").values, mesh.attributes["saliency"])
+    assert (
+        shown.layer("saliency").legend.label and len(shown.layer("saliency").legend.colors) == 256
+    )
+    assert np.allclose(shown.layer("height").values[:, 0], mesh.vertices[:, 2], atol=EXACT)
+    assert np.allclose(shown.layer("normals").values, mesh.normals, atol=EXACT)
+
+
+def test_weight_and_evidence_are_those_of_the_voxel_and_cell_that_a_vertex_lies_in(scene, results):
+    surface, shown = SurfaceMap.load(results.path / "maps" / "surface.safetensors"), scene.meshes[0]
+    data, size = surface.voxels(), surface.voxel_size
+    rows = {tuple(key): row for row, key in enumerate(data.keys.tolist())}
+    checked = 0
+    for v in range(0, len(shown.mesh.vertices), 97):
+        x = shown.mesh.vertices[v] / size
+        row = rows.get(tuple(np.floor(x).astype(int).tolist()))
+        if row is None:
+            assert np.isnan(shown.layer("weight").values[v, 0])
+            continue
+        cell = np.floor((x - np.floor(x)) * 4).astype(int) @ (16, 4, 1)
+        assert shown.layer("weight").values[v, 0] == data.weights[row]
+        assert shown.layer("evidence").values[v, 0] == data.evidence[row, cell]
+        checked += 1
+    assert checked > 10
+
+
+def test_the_cameras_are_those_of_the_trajectory_with_what_they_saw(results):
+    few = open_scene(results.path, SceneOptions(cameras=2)).cameras
+    assert [camera.name for camera in few] == ["frame 0", "frame 2"]
+    assert few[0].image is None and few[0].camera.size == (160, 120)
+    seen = open_scene(results.path, SceneOptions(images=True, image_width=40)).cameras
+    assert len(seen) == 3 and seen[1].image.shape == (30, 40, 3)
+    assert seen[1].image.std() > 1
+
+
+def test_cameras_stay_where_the_recording_is_gone(results, tmp_path):
+    moved = shutil.copytree(results.path, tmp_path / "moved")
+    record = json.loads((moved / "metrics.json").read_text())
+    record["recording"]["path"] = str(tmp_path / "gone")
+    (moved / "metrics.json").write_text(json.dumps(record))
+    cameras = open_scene(moved, SceneOptions(images=True)).cameras
+    assert len(cameras) == 3 and all(camera.image is None for camera in cameras)
+
+
+def test_answers_and_segmentation_in_the_folder_are_layers(results, tmp_path, caplog):
+    asked = shutil.copytree(results.path, tmp_path / "asked")
+    names = tmp_path / "names.txt"
+    names.write_text("red\ngreen\nblue\n")
+    text = ["--text", results.text]
+    assert cli.main(["query", str(asked), "red", *text]) == 0
+    assert cli.main(["segment", str(asked), "--labels", str(names), *text]) == 0
+    scene = open_scene(asked)
+    assert {"query: red", "segmentation"} <= set(scene.layer_names)
+    answer, classes = (scene.meshes[0].layer(name) for name in ("query: red", "segmentation"))
+    stored = read_mesh(asked / "query-red.ply").attributes
+    assert np.array_equal(answer.values, stored["relevance"])
+    assert np.abs(answer.colors / 255 - stored["color"]).max() <= EIGHT_BITS
+    assert set(classes.legend.names) <= {"red", "green", "blue"} and classes.legend.names
+    # answers to another mesh are not shown
+    stale = read_mesh(asked / "query-red.ply")
+    write_mesh(asked / "query-red.ply", replace(stale, vertices=stale.vertices + 1))
+    with caplog.at_level(logging.WARNING):
+        assert "query: red" not in open_scene(asked).layer_names
+    assert "another mesh" in caplog.text
+
+
+def test_distances_to_another_mesh_are_a_layer(tmp_path):
+    floor = rectangle((0, 0), (1, 1), 0.0, steps=4)
+    write_mesh(tmp_path / "floor.ply", floor)
+    write_mesh(tmp_path / "below.ply", rectangle((-1, -1), (2, 2), -0.25))
+    scene = open_scene(tmp_path / "floor.ply", SceneOptions(compare=tmp_path / "below.ply"))
+    layer = scene.meshes[0].layer("distance to below.ply")
+    assert np.allclose(layer.values, 0.25, atol=EXACT)
+    assert layer.legend.label == "distance to below.ply [m]"
+
+
+@pytest.mark.parametrize(
+    "name, error", [("none.ply", FileError), ("empty.ply", InputError), ("folder", FileError)]
+)
+def test_what_has_no_mesh_is_said(tmp_path, name, error):
+    empty = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    write_mesh(tmp_path / "empty.ply", empty)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(error, match=name):
+        open_scene(tmp_path / name)
+
+
+def test_values_become_the_colours_of_their_look_and_unknown_ones_grey():
+    values = np.array([0.0, 0.5, 1.0, np.nan])
+    layer = Layer.of_values("heat", values, Look("gray", (0.0, 1.0), "heat [K]"))
+    assert layer.colors[:3].tolist() == [[0] * 3, [128] * 3, [255] * 3]
+    assert layer.describe(layer.values[3]) == "unknown" and len(set(layer.colors[3].tolist())) > 1
+    assert (layer.legend.label, layer.legend.low, layer.legend.high) == ("heat [K]", 0.0, 1.0)
+    with pytest.raises(InputError, match="2 channels"):
+        Layer.of_values("pair", np.zeros((4, 2)), Look())
+
+
+def test_a_legend_names_the_classes_that_occur_the_commonest_first():
+    colors = np.array([[1, 1, 1], [2, 2, 2], [3, 3, 3]], np.uint8)
+    layer = Layer.of_labels("class", np.array([2, 2, 0, -1]), ("a", "b", "c"), colors)
+    assert layer.legend.names == ("c", "a")
+    assert layer.colors[:3].tolist() == [[3] * 3, [3] * 3, [1] * 3]
+    assert np.isnan(layer.values[3, 0])
+
+
+def test_heights_and_up_follow_the_upright_frame():
+    # a world whose y points down, as a camera's, with the floor at y = 1.5
+    T = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+    room = Mesh(np.float32([[0, 1.5, 0], [1, 1.5, 0], [0, -0.5, 2]]), np.int32([[0, 1, 2]]))
+    scene = Scene("room", (plain(room),), T_up_world=T)
+    assert scene.up.tolist() == [0, -1, 0]
+    assert scene.heights() == (0.0, 2.0)
+    eye, center = scene.overview()
+    assert scene.heights_of(eye[None])[0] > scene.heights_of(center[None])[0]
+
+
+def test_scenes_beside_each_other_do_not_touch_and_say_where_they_were():
+    cubes = [Scene(name, (plain(box(ZERO, ONE), name),)) for name in "abc"]
+    scene = beside(cubes)
+    eye, center = scene.overview()
+    right = np.cross(center - eye, scene.up)
+    right /= np.linalg.norm(right)
+    spans = [mesh.mesh.vertices @ right for mesh in scene.meshes]
+    for left, other in zip(spans, spans[1:], strict=False):
+        assert left.max() < other.min()
+    for mesh in scene.meshes:
+        assert np.allclose(mesh.mesh.vertices - mesh.offset, box(ZERO, ONE).vertices, atol=EXACT)
+    assert [mesh.offset.tolist() for mesh in overlaid(cubes).meshes] == [[0.0] * 3] * 3
+
+
+def test_a_part_holds_the_triangles_inside_with_their_values():
+    mesh = rectangle((0, 0), (1, 1), 0.0, steps=10)
+    layer = Layer.of_values("x", mesh.vertices[:, 0], Look(range=(0.0, 1.0)))
+    part = SceneMesh("floor", mesh, (layer,)).part(mesh.vertices[:, 0] <= 0.31)
+    assert len(part.mesh.faces) == 3 * 10 * 2
+    assert np.array_equal(part.layer("x").values[:, 0], part.mesh.vertices[:, 0])
+
+
+def test_a_layer_of_another_mesh_is_refused():
+    with pytest.raises(InputError, match="4 vertices"):
+        SceneMesh(
+            "floor",
+            rectangle((0, 0), (1, 1), 0.0),
+            (Layer("color", np.zeros((5, 3), np.uint8)),),
+        )
