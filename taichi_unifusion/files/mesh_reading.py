@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import FileError, InputError
 from ..types import Mesh
 from .atomic import read_bytes
+from .glb_reading import parse_own_glb
 from .ply_reading import parse_ply
 
 SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")
@@ -26,7 +27,8 @@ def read_mesh(path: str | os.PathLike[str]) -> Mesh:
 
 
 def read_any_mesh(path: str | Path) -> Mesh:
-    """Read the triangles of a mesh file, parts of a scene in their places; colour only from PLY.
+    """Read the triangles of a mesh file, parts of a scene in their places; colour only from PLY
+    and from our own GLB, which is read in the map's world, however it stands in viewers.
 
     Raises FileError where the file is missing or damaged, InputError for a suffix that is not a
     mesh's.
@@ -41,9 +43,11 @@ def read_any_mesh(path: str | Path) -> Mesh:
         raise FileError(f"{path}: no such file")
     if suffix == ".ply":
         return read_mesh(path)
-    import trimesh  # a second of import
-
     try:
+        if suffix == ".glb" and (own := parse_own_glb(read_bytes(path))):
+            return own
+        import trimesh  # a second of import
+
         return _joined(trimesh.load_scene(path, process=False))
     except Exception as error:  # noqa: BLE001 - its readers raise whatever they stumble over
         reason = " ".join(str(error).split())[:200]

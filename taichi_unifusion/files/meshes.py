@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from numpy.typing import NDArray
+
 from ..errors import InputError, MissingDependency
 from .atomic import atomic_write
 from .glb import write_glb
@@ -13,12 +15,14 @@ from .ply import Triangles, colors_of, write_ply
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 
 
-def write_mesh(path: str | os.PathLike, mesh: Triangles) -> None:
+def write_mesh(path: str | os.PathLike, mesh: Triangles, T_up_world: NDArray | None = None) -> None:
     """Write `mesh` atomically; the suffix of `path` chooses PLY (binary), GLB or OBJ.
 
-    Attribute "color" becomes 8-bit RGB. PLY holds all other attributes as float properties, GLB and
-    OBJ leave them out. Raises InputError for another suffix, bad face indices or an empty GLB/OBJ,
-    FileError where the file cannot be written.
+    Attribute "color" becomes 8-bit RGB, which GLB holds as linear light. PLY holds all other
+    attributes as float properties, GLB and OBJ leave them out. A GLB whose world has a known up,
+    `T_up_world` (4, 4), stands upright in viewers; the other formats hold the world as it
+    is. Raises InputError for another suffix, bad face indices or an empty GLB/OBJ, FileError where
+    the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -39,7 +43,10 @@ def write_mesh(path: str | os.PathLike, mesh: Triangles) -> None:
             temporary.write_bytes(content)
         return
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        (write_ply if suffix == ".ply" else write_glb)(file, mesh)
+        if suffix == ".ply":
+            write_ply(file, mesh)
+        else:
+            write_glb(file, mesh, T_up_world=T_up_world)
 
 
 def _encode_obj(path: Path, mesh: Triangles) -> bytes:

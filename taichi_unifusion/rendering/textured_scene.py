@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import CapacityError, DatasetError, MissingDependency, UniFusionError
+from ..files.atomic import read_bytes
+from ..files.glb_reading import parse_own_glb
+from ..files.srgb import linear_to_srgb
 from ..types import Mesh, PinholeCamera, check_rigid
 from .depth_buffer import DepthBuffer, draw_depth_buffer
 
@@ -195,6 +198,9 @@ def load_scene(path: str | Path) -> TexturedScene:
             f"{path}: reading a scene needs trimesh: pip install trimesh"
         ) from None
     try:
+        own = parse_own_glb(read_bytes(path)) if Path(path).suffix.lower() == ".glb" else None
+        if own is not None and "color" in own.attributes:
+            return _colored(own)
         scene: Any = trimesh.load(str(path), force="scene", process=False)
         # sorted: the same order in every run
         placed = [(name, *scene.graph[name]) for name in sorted(scene.graph.nodes_geometry)]
@@ -203,7 +209,9 @@ def load_scene(path: str | Path) -> TexturedScene:
             for name, T, key in placed
             if hasattr(scene.geometry[key], "faces")
         ]
-        return _assemble(path, parts)
+        if own is not None:  # upright for viewers only
+            parts = [(name, np.eye(4), mesh) for name, _, mesh in parts]
+        return _assemble(path, parts, linear=_is_gltf(path))
     except UniFusionError:
         raise
     except Exception as error:  # a damaged file fails anywhere in its parser
@@ -212,8 +220,31 @@ def load_scene(path: str | Path) -> TexturedScene:
         ) from error
 
 
-def _assemble(path: str | Path, parts: Sequence[tuple[str, NDArray, Any]]) -> TexturedScene:
-    """One scene of (name, T_world_mesh, trimesh.Trimesh)."""
+def _is_gltf(path: str | Path) -> bool:
+    return Path(path).suffix.lower() in (".glb", ".gltf")
+
+
+def _colored(mesh: Mesh) -> TexturedScene:
+    """A scene of one mesh with colours at its vertices."""
+    faces = len(mesh.faces)
+    return TexturedScene(
+        mesh.vertices,
+        mesh.attributes["color"],
+        mesh.faces,
+        np.zeros((faces, 6), np.float32),
+        np.full(faces, -1, np.int32),
+        np.zeros(faces, np.int32),
+        ("map",),
+        (),
+    )
+
+
+def _assemble(
+    path: str | Path, parts: Sequence[tuple[str, NDArray, Any]], *, linear: bool
+) -> TexturedScene:
+    """One scene of (name, T_world_mesh, trimesh.Trimesh), whose vertex colours may be linear
+    light.
+    """
     parts = [part for part in parts if len(part[2].faces)]
     if not parts:
         raise DatasetError(f"{path}: there are no triangles in it")
@@ -228,7 +259,7 @@ def _assemble(path: str | Path, parts: Sequence[tuple[str, NDArray, Any]]) -> Te
         if not np.isfinite(vertices).all():
             raise DatasetError(f"{path}: a vertex is not finite")
         faces = np.asarray(mesh.faces)
-        look = _look_of(mesh)
+        look = _look_of(mesh, linear)
         texture = -1
         if look.image is not None and look.uv is not None:
             key = hashlib.sha256(look.image.tobytes()).digest() + bytes(
@@ -266,14 +297,14 @@ class _Look:
     uv: NDArray[np.float64] | None = None
 
 
-def _look_of(mesh: Any) -> _Look:
+def _look_of(mesh: Any, linear: bool) -> _Look:
     visual = mesh.visual
     if visual.kind != "texture":
-        colors = (
-            np.asarray(visual.vertex_colors)[:, :3]
-            if visual.kind
-            else np.full((len(mesh.vertices), 3), GREY)
-        )
+        if not visual.kind:
+            colors = np.full((len(mesh.vertices), 3), GREY)
+        else:
+            colors = np.asarray(visual.vertex_colors)[:, :3]
+            colors = 255 * linear_to_srgb(colors / 255) if linear else colors
         return _Look(np.ascontiguousarray(colors / 255.0, np.float32))
     material = visual.material
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)

@@ -12,9 +12,12 @@ from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.scene import SceneDataset, kinect_camera
 from taichi_unifusion.datasets.synthetic import look_at
 from taichi_unifusion.errors import DatasetError, InputError, PoseError
+from taichi_unifusion.files.glb import write_glb
+from taichi_unifusion.files.meshes import write_mesh
+from taichi_unifusion.files.texture import Texture
 from taichi_unifusion.files.trajectories import write_trajectory
 from taichi_unifusion.rendering.textured_scene import load_scene, mip_levels
-from taichi_unifusion.types import PinholeCamera, Trajectory
+from taichi_unifusion.types import Mesh, PinholeCamera, Trajectory
 
 trimesh = pytest.importorskip("trimesh")
 Image = pytest.importorskip("PIL.Image")
@@ -314,3 +317,33 @@ def test_other_file_types_give_the_same_view(scene, tmp_path):
         load_scene(tmp_path / "floor.ply").colors,
         floor.visual.vertex_colors[:, :3] / np.float32(255),
     )
+
+
+def test_vertex_colors_of_gltf_are_linear_light(tmp_path):
+    floor = box_scene().geometry["floor"]
+    trimesh.Scene([floor]).export(tmp_path / "other.glb")
+    np.testing.assert_allclose(
+        load_scene(tmp_path / "other.glb").colors[3], trimesh.visual.color.linear_to_srgb(90 / 255)
+    )
+
+
+def test_our_own_glb_is_a_scene_in_the_world_of_its_map(tmp_path):
+    floor = box_scene().geometry["floor"]
+    colors = (floor.visual.vertex_colors[:, :3] / 255).astype(np.float32)
+    mesh = Mesh(
+        floor.vertices.astype(np.float32), floor.faces.astype(np.int32), None, {"color": colors}
+    )
+    up = np.eye(4)
+    up[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    write_mesh(tmp_path / "colored.glb", mesh, T_up_world=up)
+    scene = load_scene(tmp_path / "colored.glb")
+    assert np.array_equal(scene.vertices, mesh.vertices)
+    np.testing.assert_allclose(scene.colors, colors, atol=1e-6)
+    assert scene.render(CAMERA, look_at((0.2, -2, 1), (0, 0, -0.6))).color.std() > 10
+    texture = Texture(np.array([(0, 1), (1, 1), (1, 0), (0, 0)], np.float32), checkers())
+    with open(tmp_path / "textured.glb", "wb") as file:
+        write_glb(file, mesh, texture, T_up_world=up, image="png")
+    scene = load_scene(tmp_path / "textured.glb")
+    assert np.array_equal(scene.vertices, mesh.vertices)
+    assert np.array_equal(scene.textures[0], checkers())
+    np.testing.assert_allclose(scene.corners[0], texture.coordinates[[0, 1, 2]].ravel(), atol=1e-6)
