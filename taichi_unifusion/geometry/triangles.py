@@ -76,14 +76,23 @@ def sample_surface(
     Stratified along the list of triangles: each of `count` equal shares of the area gives one
     point, so that the sample varies less than independent draws would.
     """
+    return sample_patches(vertices, faces, count, rng)[0]
+
+
+def sample_patches(
+    vertices: NDArray, faces: NDArray, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points as `sample_surface` draws them, and the unit normals of their triangles: (N, 3) each."""
     total = np.cumsum(areas(vertices, faces))
     picked = np.searchsorted(
         total, (np.arange(count) + rng.random(count)) * (total[-1] / count), side="right"
     )
-    corners = vertices[faces].astype(np.float64)
-    a, b, c = corners[np.minimum(picked, len(corners) - 1)].swapaxes(0, 1)
+    picked = faces[np.minimum(picked, len(faces) - 1)]
+    a, b, c = vertices[picked].astype(np.float64).swapaxes(0, 1)
     root, share = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
-    return (1 - root) * a + root * (1 - share) * b + root * share * c
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return (1 - root) * a + root * (1 - share) * b + root * share * c, normals
 
 
 class SurfaceDistance:
