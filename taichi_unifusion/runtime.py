@@ -16,6 +16,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass
@@ -127,6 +128,9 @@ class Runtime:
         self.grids: WeakSet[Any] = WeakSet()  # of the maps that live
         self.leaves: dict[Any, int] = {}  # index tree -> leaves that it ever had, at most
         self.earlier: dict[Any, int] = {}  # those that it had for maps that are gone
+        # the index tree of the map that was made last, and by tree which ones came after it
+        self.last_tree: Any = None
+        self.followers: defaultdict[Any, set[Any]] = defaultdict(set)
 
     def count_tree(self) -> None:
         """Note that one more index tree is made; raises CapacityError before there are more than

@@ -85,7 +85,9 @@ def test_S5_one_frame_gives_a_coloured_mesh(frames):
         done.points == step.points and done.voxels > 0 and done.total_voxels == 0  # not fused yet
         for done in step.integrations.values()
     )
-    assert list(step.milliseconds) == STAGES[1:] and min(step.milliseconds.values()) > 0
+    # nothing is fused yet, but what fuses is compiled
+    assert list(step.milliseconds) == [*STAGES[1:], *FUSING]
+    assert min(step.milliseconds.values()) > 0
     assert min(map(len, pipeline.maps.values())) > 0
     mesh = pipeline.extract_mesh()
     assert len(mesh.faces) > 0 and mesh.attributes["color"].shape == (len(mesh.vertices), 3)
@@ -125,9 +127,10 @@ def test_a_run_is_its_steps_in_order(pipeline, frames):
         by_hand.step(frame)
     assert contents(pipeline) == contents(by_hand) and min(map(len, by_hand.maps.values())) > 0
     assert [step.index for step in result.steps] == [0, 1, 2] and told == [(1, 3), (2, 3), (3, 3)]
-    assert all(list(step.milliseconds) == STAGES for step in result.steps[:-1])
-    # with the last one, what waits is fused
-    assert list(result.steps[-1].milliseconds) == [*STAGES, "surface", "color"]
+    first, *between, last = (list(step.milliseconds) for step in result.steps)
+    assert all(stages == STAGES for stages in between)
+    # with the first frame, kernels are compiled; with the last one, what waits is fused
+    assert first == last == [*STAGES, *FUSING]
     assert (result.skipped, result.warnings, result.interrupted, result.failure) == (
         (),
         (),
@@ -173,6 +176,16 @@ def test_F1_F2_F4_F10_a_frame_without_usable_depth_is_skipped_counted_and_said(
         for record in caplog.records
         if record.levelno == logging.WARNING
     ] == [True]
+
+
+def test_the_first_frame_compiles_what_fuses_its_window(frames):
+    pipeline = Pipeline(CONFIG)
+    pipeline.step(frames[0])
+    before = compiled()
+    for frame in [*frames[1:], *frames]:  # the others are farther from the last frame than usual
+        pipeline.step(frame)
+    pipeline.flush()
+    assert compiled() == before and len(pipeline.surface) > 0
 
 
 def test_a_frame_without_pose_is_skipped(pipeline, frames):

@@ -197,7 +197,7 @@ class Binner:
         keys = borrow("keys", ti.i32, KEY_COLUMNS)
         copy_rows(n, arrays.keys, keys)
         masks, support = borrow("masks", ti.u32, 2), borrow("support", ti.u32, 2)
-        neighbors, rows = borrow("neighbors", ti.i32, 27), np.empty((n, 3), np.int32)
+        neighbors, rows = borrow("neighbors", ti.i32, 27), np.zeros((max(n, 1), 3), np.int32)
         kernels.mark_cells(
             n, arrays.sums, self.support_points, self.frames, arrays.keys, masks, support, rows
         )
@@ -209,7 +209,8 @@ class Binner:
         kernels.compact_cells(n, rows, masks, arrays.width, arrays.sums, averages)
         find_neighbors(self.grid.index, cells.stamp, n, keys, neighbors)
         forget_blocks(0, n, keys, self.grid.index)
-        self.grid.unclosed = None
+        if n:
+            self.grid.unclosed = None
         return Binned(loan, n, keys, neighbors, masks, support, rows, averages)
 
     def _shared(self, use: str, width: int) -> CellArrays:

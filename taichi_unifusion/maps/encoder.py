@@ -110,8 +110,8 @@ class Encoder:
             source.loan,
             source.count,
             source.keys,
-            arena.borrow("encoded", ti.f32, (source.count, *row)),
-            arena.borrow("weights", ti.f32, (source.count,)),
+            arena.borrow("encoded", ti.f32, (max(source.count, 1), *row)),
+            arena.borrow("weights", ti.f32, (max(source.count, 1),)),
             source.support,
             layout.channels,
         )

@@ -40,7 +40,7 @@ class RegressionGrid(VoxelGrid):
         unchanged.
         """
         local.check()
-        slots = np.empty(local.count, np.int32)
+        slots = np.empty(max(local.count, 1), np.int32)
         encoded = self.claim(local.count, local.keys, local.weights, slots)
         self._fuse(local, slots, 1.0)
         return encoded

@@ -134,9 +134,7 @@ class VoxelGrid:
         if not free and self.runtime.trees >= runtime.MAX_TREES:
             gc.collect()  # maps that only a cycle holds, as the traceback of a run that failed
         if free:
-            # one of an equal map, for which kernels are compiled already, if there is one
-            alike = [place for place, (fields, _) in enumerate(free) if fields == self.fields]
-            _, tree = free.pop(alike[-1] if alike else -1)
+            _, tree = free.pop(self._most_alike(free))
             self.runtime.earlier[tree] = _count_free(self.runtime, tree)
             if self.runtime.device == "cpu":
                 tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
@@ -155,7 +153,20 @@ class VoxelGrid:
                 )
             tree = _build_tree()
         weakref.finalize(self, free.append, (self.fields, tree))
+        self.runtime.followers[self.runtime.last_tree].add(tree)
+        self.runtime.last_tree = tree
         return tree
+
+    def _most_alike(self, free: Sequence[tuple[tuple[VoxelField, ...], kernels.Index]]) -> int:
+        """The place of a tree for which kernels are compiled already: that of an equal map, or,
+        since some kernels take two, one that came after that of the last map before, if that lives.
+        """
+        last = self.runtime.last_tree
+        after = self.runtime.followers[last] if all(last is not tree for _, tree in free) else ()
+        followers = [place for place, (_, tree) in enumerate(free) if tree in after]
+        alike = [place for place, (fields, _) in enumerate(free) if fields == self.fields]
+        both = [place for place in alike if place in followers]
+        return [-1, *followers, *alike, *both][-1]
 
     def next_frame(self) -> int:
         """A new frame stamp, which makes every block number of earlier frames void."""

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -169,6 +170,14 @@ class Window:
             find(self._targets(direct, (first[0], first[1])), write=False)
         return patches
 
+    def rehearse(self, names: tuple[str, ...]) -> None:
+        """Fuse no voxel to the maps of a part: what that takes is compiled then, and no later frame
+        waits for it.
+        """
+        part = self.parts[names]
+        for piece in self._pieces(replace(part, cells=replace(part.cells, count=0))):
+            piece.work()
+
     def close(self, keep: Keep | None = None) -> list[Piece]:
         """The work that fuses the window, in order; the sums are free for another one. `keep` is
         told in the end what it was.
@@ -204,19 +213,19 @@ class Window:
         part.cells.arrays.grow_ahead(part.cells.count)
         local = encoder.room(binned)
         step = PIECE // encoder.layout.size
-        for begin in range(0, binned.count, step):
+        for begin in range(0, max(binned.count, 1), step):
             end = min(begin + step, binned.count)
             yield Piece(name, partial(encoder.encode_blocks, binned, begin, end, local))
         yield Piece(name, partial(part.part.fuse, local))
         for each in self.surfaces:
             if each in part.part.maps:
-                for n in range(VOTE_PIECES):
-                    yield Piece(name, partial(self._vote, each, n))
+                ends = np.linspace(0.0, 1.0 if binned.count else 0.0, VOTE_PIECES + 1)
+                for share in pairwise(ends):
+                    yield Piece(name, partial(self._vote, each, share))
 
-    def _vote(self, surface: SurfaceMap, piece: int) -> None:
-        """Let all views vote in one of the parts of a map."""
-        count = surface.grid.count
-        slots = piece * count // VOTE_PIECES, (piece + 1) * count // VOTE_PIECES
+    def _vote(self, surface: SurfaceMap, share: tuple[float, float]) -> None:
+        """Let all views vote in a share of the voxels of a map, from and to."""
+        slots = int(share[0] * surface.grid.count), int(share[1] * surface.grid.count)
         surface.vote(self.images, self.camera, self._poses(), slots)
 
 
@@ -232,6 +241,7 @@ class WindowFusion:
         self.size, self.keep = size, keep
         self.window: Window | None = None
         self.pieces: deque[Piece] = deque()
+        self._rehearsals: list[Piece] = []  # for the first frame that has something for a part
         self._maps: set[RegressionMap] = set()  # that wait
         self._index, self._stride = 0, 0  # of the last frame in its recording, and the usual step
         self._room: dict[tuple[str, ...], tuple[CellArrays, Arena]] = {}
@@ -260,6 +270,7 @@ class WindowFusion:
         its patches too. Returns and raises as `Window.add`, with nothing changed where it raises.
         """
         parts = [part for group in groups for part in group.parts(frame)]
+        new = [part.names for part in parts if part.names not in self._known]
         window = self.window or Window(
             frame.require_pose(),
             frame.camera,
@@ -271,6 +282,10 @@ class WindowFusion:
         patches, touched = window.add(frame, find, reach)
         if patches.total == 0:
             return patches, touched
+        if self.size > 1:
+            self._rehearsals = [
+                Piece(" + ".join(names), partial(window.rehearse, names)) for names in new
+            ]
         if self._index and not self._stride:
             self._stride = abs(frame.index - self._index)
         self.window, self._index = window, frame.index
@@ -294,6 +309,8 @@ class WindowFusion:
         """The pieces to do now, so that all are done when the next window is full, or in so many
         frames.
         """
+        while self._rehearsals:
+            yield self._rehearsals.pop(0)
         frames_left = frames or self.size - (len(self.window) if self.window else 0)
         for _ in range(-(-len(self.pieces) // max(frames_left, 1))):
             yield self.pieces.popleft()
