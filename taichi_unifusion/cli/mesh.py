@@ -10,9 +10,10 @@ from tyro.conf import Positional, arg
 
 from ..config import MeshSettings
 from ..errors import FileError, InputError, UniFusionError
+from ..geometry.gravity import parse_up
 from ..results.run_folder import RunFolder
 from ..results.tables import format_bytes
-from .options import Device
+from .options import Device, UpOption
 from .terminal import report
 
 
@@ -33,6 +34,8 @@ class ExtractMesh:
     """Where to write it: .ply, .glb or .obj; by default the meshes of single properties, the pictures
     and the sizes in the record follow.
     """
+    up: UpOption = None
+    """Another up for the pictures and the record: an axis as z or -y, or three numbers."""
     device: Device = "auto"
     """Where to compute."""
 
@@ -43,6 +46,7 @@ def extract_mesh(options: ExtractMesh) -> int:
     from ..files.maps import read_manifest
     from ..files.meshes import MESH_SUFFIXES, write_mesh
 
+    up = parse_up(options.up) if options.up else None
     folder = RunFolder(options.dir)
     files = [options.out] if options.out else [folder.mesh_file("ply"), folder.mesh_file("glb")]
     if files[0].suffix.lower() not in MESH_SUFFIXES:
@@ -85,7 +89,7 @@ def extract_mesh(options: ExtractMesh) -> int:
     if not options.out:
         from ..results.mesh_update import update_folder
 
-        updated = update_folder(folder, mesh)
+        updated = update_folder(folder, mesh, up)
         print(f"{folder.path}: {', '.join(updated.files)} follow the new mesh")
         failures += updated.failures
     return report(failures)

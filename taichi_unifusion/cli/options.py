@@ -23,6 +23,9 @@ OPTIONAL = "(optional)"
 ONE_EACH = "(give it once for each)"
 
 Settings = Annotated[Config, arg(name="")]
+UpOption = Annotated[
+    str | None, arg(metavar="X,Y,Z", help_behavior_hint="(default: from the floor; write --up=-y)")
+]
 Device = Literal["auto", "cuda", "cpu"]
 
 
@@ -93,6 +96,8 @@ class OutputOptions:
     """YAML file of settings that differ from the defaults; options given here count more."""
     json: FlagCreatePairsOff[bool] = False
     """Print the metrics as JSON instead of tables."""
+    up: UpOption = None
+    """Which way is up in the world: an axis as z or -y, or three numbers."""
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,9 @@ def query(options: Query) -> int:
         )
         writer.write(
             picture,
-            lambda path, mesh=mesh, cameras=cameras: render_preview(mesh, path, trajectory=cameras),
+            lambda path, mesh=mesh, cameras=cameras: render_preview(
+                mesh, path, trajectory=cameras, up=understood.outlook.up.direction
+            ),
         )
         listed.append({"mesh": file.name, "picture": picture.name, **describe(answer, options.top)})
     text = json.dumps(listed, indent=2)

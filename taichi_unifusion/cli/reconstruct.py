@@ -12,6 +12,7 @@ from tyro.conf import arg
 
 from ..config import Config
 from ..datasets import Dataset
+from ..geometry.gravity import Up, parse_up
 from ..tracking import check_poses, track
 from .interrupts import INTERRUPTED, stop_on_signal
 from .options import (
@@ -63,6 +64,7 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     check_poses(recording, options.poses.tracking, options.poses.trajectory)
     from ..results.writer import prepare_results, remove_temporaries
 
+    up = parse_up(options.output.up) if options.output.up else None
     folder = prepare_results(options.output.out)
     if earlier := folder.earlier_run():
         logger.warning(
@@ -71,7 +73,7 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
             earlier,
         )
     with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
-        return _fuse_and_write(recording, options, folder, stop, encoder)
+        return _fuse_and_write(recording, options, folder, stop, encoder, up)
 
 
 def _fuse_and_write(
@@ -80,6 +82,7 @@ def _fuse_and_write(
     folder: RunFolder,
     stop: Callable[[], bool],
     encoder: ImageEncoder | None,
+    up: Up | None,
 ) -> int:
     from ..pipeline import Pipeline
     from ..results.summary import summarize
@@ -110,7 +113,7 @@ def _fuse_and_write(
             done,
             len(frames),
         )
-    results = write_results(folder.path, pipeline, run, source, tracking, written)
+    results = write_results(folder.path, pipeline, run, source, tracking, written, up)
     print(
         json.dumps(results.record.to_json(), indent=2)
         if options.output.json

@@ -74,7 +74,7 @@ def segment(options: Segment) -> int:
     writer.write(
         folder.segmentation_picture,
         lambda path: write_png(
-            path, segmentation_picture(mesh, found, colors, understood.trajectory)
+            path, segmentation_picture(mesh, found, colors, understood.outlook.views)
         ),
     )
     summary: dict[str, Any] = {"labels": _shares(names, found, colors)}

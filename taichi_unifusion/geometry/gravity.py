@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from .triangles import areas, sample_patches
 
 How = Literal["given", "floor", "convention", "cameras", "guess"]
@@ -40,6 +41,7 @@ LEAST_EXTENT = (
     0.15  # [m] standard deviation of a plane's samples along its narrow side, to be fitted
 )
 CONVENTION = np.sin(np.radians(1.5))  # how level all cameras of a levelled recording are
+LEVELLED = np.cos(np.radians(0.5))  # a floor's normal so near an axis of the world is that axis
 LEAST_MEAN = 0.2  # length of the mean of the cameras' up, below which it says nothing
 AXES = (
     (0, 0, 1.0),
@@ -76,6 +78,29 @@ class Up:
     def sentence(self) -> str:
         """How it was found, in words."""
         return SAID[self.how]
+
+
+def parse_up(text: str) -> Up:
+    """Up as a user writes it: an axis of the world, as in "z" or "-y", or three numbers "x,y,z"."""
+    name = text.strip().lower()
+    if name.removeprefix("-") in ("x", "y", "z"):
+        axis = np.eye(3)["xyz".index(name[-1])]
+        return Up(-axis if name[0] == "-" else axis, "given")
+    try:
+        direction = np.array([float(word) for word in name.split(",")])
+        length = float(np.linalg.norm(direction))
+    except ValueError:
+        direction, length = np.zeros(0), 0.0
+    if direction.shape != (3,) or not 0 < length < np.inf:
+        raise InputError(
+            f"up: expected an axis as z or -y, or three numbers as 0,-0.9,0.1, got '{text[:80]}'"
+        )
+    return Up(direction / length, "given")
+
+
+def up_of_transform(T_up_world: NDArray, how: How) -> Up:
+    """The Up whose T_up_world (4, 4) this is."""
+    return Up(np.array(T_up_world[2, :3], np.float64), how, -float(T_up_world[2, 3]))
 
 
 def smallest_turn(a: NDArray, b: NDArray) -> NDArray[np.float64]:
@@ -117,7 +142,14 @@ def find_up(vertices: NDArray, faces: NDArray, T_world_camera: NDArray) -> Up:
     others = [each.score for each in found if each.direction @ found[0].direction < OTHER]
     if not found or max(others, default=0.0) > CLEAR * found[0].score:
         return fallback
-    return Up(found[0].direction, "floor", found[0].floor)
+    return Up(_levelled(found[0].direction), "floor", found[0].floor)
+
+
+def _levelled(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The axis of the world that is so near that the world was levelled, or the direction itself."""
+    place = int(np.abs(direction).argmax())
+    axis = np.eye(3)[place] * np.sign(direction[place])
+    return axis if axis @ direction > LEVELLED else direction
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rendering.preview import draw_preview
+from ..rendering.drawing import Viewpoint
+from ..rendering.preview import draw_views
 from ..types import Mesh, Trajectory
 from .questions import UNLABELLED, Segmentation
 
@@ -91,12 +92,12 @@ def label_mesh(mesh: Mesh, found: Segmentation, labels: Sequence[int], colors: N
 
 
 def segmentation_picture(
-    mesh: Mesh, found: Segmentation, colors: NDArray, trajectory: Trajectory | None
+    mesh: Mesh, found: Segmentation, colors: NDArray, views: Sequence[Viewpoint]
 ) -> NDArray[np.uint8]:
     """Views of a labelled mesh (H, W, 3) RGB beside the names that occur in it, the commonest
     first.
     """
-    picture = draw_preview(mesh, trajectory=trajectory)
+    picture = draw_views(mesh, views)
     counts = np.bincount(found.labels[found.labels != UNLABELLED], minlength=len(found.names))
     present = [i for i in np.argsort(-counts, kind="stable") if counts[i]]
     height = picture.shape[0]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, check_choice
 from ..files.images import write_png
+from ..geometry.gravity import find_up
 from ..geometry.triangles import area_vectors
 from ..types import Mesh, PinholeCamera, Trajectory, check_rigid
 from .drawing import Drawable, Viewpoint
@@ -42,26 +43,50 @@ def render_preview(
     path: str | os.PathLike,
     *,
     trajectory: Trajectory | None = None,
+    up: NDArray | None = None,
     views: Sequence[str] | None = None,
     size: tuple[int, int] = (960, 720),
 ) -> None:
     """Write what `draw_preview` gives as a PNG; raises FileError on writing."""
-    write_png(path, draw_preview(mesh, trajectory=trajectory, views=views, size=size))
+    write_png(path, draw_preview(mesh, trajectory=trajectory, up=up, views=views, size=size))
 
 
 def draw_preview(
     mesh: Mesh,
     *,
     trajectory: Trajectory | None = None,
+    up: NDArray | None = None,
     views: Sequence[str] | None = None,
     size: tuple[int, int] = (960, 720),
 ) -> NDArray[np.uint8]:
-    """One picture (H, W, 3) RGB of views of `mesh`, each of `size` (width, height) pixels, side by
-    side.
+    """One picture (H, W, 3) RGB of views of `mesh`, as `choose_views` finds them, side by side."""
+    return draw_views(
+        mesh, choose_views(mesh, trajectory=trajectory, up=up, views=views, size=size)
+    )
+
+
+def draw_views(mesh: Mesh, views: Sequence[Viewpoint]) -> NDArray[np.uint8]:
+    """One picture (H, W, 3) RGB of a mesh from one or more viewpoints of equal height, side by side."""
+    drawable = Drawable.of(mesh)
+    camera = views[0].camera
+    gap = np.full((camera.height, max(2, camera.width // 120), 3), 255, np.uint8)
+    panels = [panel for view in views for panel in (gap, drawable.draw(view))]
+    return np.hstack(panels[1:])
+
+
+def choose_views(
+    mesh: Mesh,
+    *,
+    trajectory: Trajectory | None = None,
+    up: NDArray | None = None,
+    views: Sequence[str] | None = None,
+    size: tuple[int, int] = (960, 720),
+) -> tuple[Viewpoint, ...]:
+    """Where to look at `mesh` from, each for a picture of `size` (width, height) pixels.
 
     `views` are names of VIEWS: camera and overview where there are poses, else overview and
-    opposite. Up is the mean of the cameras' up, or +z. Raises InputError for a mesh without a
-    finite triangle or an unknown view.
+    opposite. `up` (3,) is a unit vector of the world; without it `find_up` tells. Raises
+    InputError for a mesh without a finite triangle or an unknown view.
     """
     has_poses = trajectory is not None and len(trajectory) > 0
     names = (
@@ -73,11 +98,9 @@ def draw_preview(
         check_choice("preview: view", name, VIEWS)
         if name == "camera" and not has_poses:
             raise InputError("preview: view 'camera' needs a trajectory")
-    drawable = Drawable.of(mesh)
-    chosen = _choose_views(drawable, trajectory if has_poses else None, names, size)
-    gap = np.full((size[1], max(2, size[0] // 120), 3), 255, np.uint8)
-    panels = [panel for view in chosen for panel in (gap, drawable.draw(view))]
-    return np.hstack(panels[1:])
+    matrices = trajectory.T_world_camera if trajectory is not None and has_poses else ()
+    poses = np.array([check_rigid(T, f"preview: pose {i}") for i, T in enumerate(matrices)])
+    return _choose_views(Drawable.of(mesh), poses.reshape(-1, 4, 4), up, names, size)
 
 
 @dataclass(frozen=True)
@@ -89,26 +112,26 @@ class _Surface:
 
 
 def _choose_views(
-    drawable: Drawable, trajectory: Trajectory | None, names: Sequence[str], size: tuple[int, int]
-) -> list[Viewpoint]:
+    drawable: Drawable,
+    poses: NDArray[np.float64],
+    up: NDArray | None,
+    names: Sequence[str],
+    size: tuple[int, int],
+) -> tuple[Viewpoint, ...]:
     surface = _sample_surface(drawable)
-    matrices = () if trajectory is None else trajectory.T_world_camera
-    poses = [check_rigid(T, f"preview: pose {i}") for i, T in enumerate(matrices)]
-    # y of a camera points down
-    mean_up = -np.mean([T[:3, 1] for T in poses], axis=0) if poses else np.zeros(3)
-    length = float(np.linalg.norm(mean_up))
-    up = mean_up / length if length > 0.2 else _guess_up(surface)
+    if up is None:
+        up = find_up(drawable.vertices, drawable.faces, poses).direction
     directions = _overview_directions(up)
     shown = _shown_area(surface, directions)
     best = int(shown.argmax())
     turned = np.minimum(np.arange(AZIMUTHS), AZIMUTHS - np.arange(AZIMUTHS)) >= AZIMUTHS // 6
     second = (best + int(np.where(turned, np.roll(shown, -best), -1.0).argmax())) % AZIMUTHS
     makers = {
-        "camera": lambda: _camera_view(drawable, np.array(poses), up, size),
+        "camera": lambda: _camera_view(drawable, poses, up, size),
         "overview": lambda: _overview(surface, directions[best], up, size),
         "opposite": lambda: _overview(surface, directions[second], up, size),
     }
-    return [makers[name]() for name in names]
+    return tuple(makers[name]() for name in names)
 
 
 def _sample_surface(drawable: Drawable, count: int = 30_000) -> _Surface:
@@ -129,15 +152,6 @@ def _shown_area(surface: _Surface, directions: NDArray) -> NDArray[np.float64]:
     parts counted too.
     """
     return np.maximum(surface.normals @ directions.T, 0).mean(axis=0)
-
-
-def _guess_up(surface: _Surface) -> NDArray[np.float64]:
-    """+z, unless a view from above would mostly show backs: then the up of a camera frame (-y), or
-    what shows most.
-    """
-    ups = np.array([[0, 0, 1.0], [0, -1.0, 0], [0, 1.0, 0], [0, 0, -1.0]])
-    shown = np.array([_shown_area(surface, _overview_directions(up)).max() for up in ups])
-    return ups[int((shown >= 0.6 * shown.max()).argmax())]
 
 
 def _overview_directions(up: NDArray) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from ..files.maps import read_map
 from ..files.mesh_reading import read_mesh
 from .record import Source, read_record
 from .run_folder import RunFolder
-from .summary import count_frames
+from .summary import count_frames, describe_up
 from .tables import format_bytes, format_table
 
 T = TypeVar("T")
@@ -110,6 +110,8 @@ def _describe_run(file: Path) -> str:
     if frame := record.milliseconds.get("frame"):
         made += f", {frame.median:.0f} ms a frame (median)"
     lines.append(made)
+    if record.T_up_world is not None:
+        lines.append(f"up      {describe_up(record)}")
     return "\n".join(lines)
 
 

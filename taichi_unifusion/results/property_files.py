@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +12,11 @@ from ..errors import FileError, InputError
 from ..files.images import write_png
 from ..pipeline import Pipeline
 from ..properties import SurfaceProperty
+from ..rendering.drawing import Viewpoint
 from ..rendering.legend import draw_legend, property_mesh
 from ..rendering.look import Look, shown_range
-from ..rendering.preview import draw_preview
-from ..types import Mesh, Trajectory
+from ..rendering.preview import draw_views
+from ..types import Mesh
 from .folder_writer import FolderWriter
 from .record import PropertyRecord, read_record
 from .run_folder import RunFolder
@@ -46,9 +47,7 @@ def property_meshes(folder: RunFolder, mesh: Mesh) -> dict[Path, Mesh]:
     }
 
 
-def redraw_property_pictures(
-    writer: FolderWriter, mesh: Mesh, trajectory: Trajectory | None
-) -> None:
+def redraw_property_pictures(writer: FolderWriter, mesh: Mesh, views: Sequence[Viewpoint]) -> None:
     """Draw again what pictures of single properties a results folder holds, of `mesh`."""
     folder = writer.folder
     pictures = {name: folder.property_picture(name) for name in mesh.attributes if name != "color"}
@@ -61,7 +60,7 @@ def redraw_property_pictures(
             writer.write(
                 picture,
                 lambda path, shown=shown, name=name, look=look: write_property_picture(
-                    path, shown, name, look, trajectory
+                    path, shown, name, look, views
                 ),
             )
 
@@ -81,10 +80,10 @@ def _look(shown: PropertyRecord) -> Look:
 
 
 def write_property_picture(
-    path: Path, shown: Mesh, name: str, look: Look, trajectory: Trajectory | None
+    path: Path, shown: Mesh, name: str, look: Look, views: Sequence[Viewpoint]
 ) -> None:
     """A picture of a mesh in the colours of its property `name`, above their legend."""
-    picture = draw_preview(shown, trajectory=trajectory)
+    picture = draw_views(shown, views)
     values = shown.attributes[name]
     legend = draw_legend(picture.shape[1], name, look, *shown_range(values, look), values.shape[1])
     write_png(path, np.vstack([picture, legend]))

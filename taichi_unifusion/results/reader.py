@@ -19,7 +19,9 @@ from ..evaluation.trajectory import align_poses, match_poses
 from ..evaluation.viewpoints import Viewpoints
 from ..files.mesh_reading import read_mesh
 from ..files.trajectories import read_trajectory
+from ..geometry.gravity import Up
 from ..types import Mesh, Trajectory
+from .outlook import read_up
 from .record import Source, read_record
 from .run_folder import RunFolder
 
@@ -61,6 +63,10 @@ class Run:
                 f"{path}: no such file; make it with: unifusion mesh {self.folder.path}"
             )
         return read_mesh(path)
+
+    def up(self) -> Up:
+        """Which way is up in the run's world, and where the floor is."""
+        return read_up(self.folder, self.mesh())
 
     def trajectory(self) -> Trajectory:
         """The poses that the run used, one a frame of `used`."""

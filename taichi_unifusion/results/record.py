@@ -116,6 +116,16 @@ class MeshRecord:
     triangles: int
 
 
+@dataclass(frozen=True)
+class ViewRecord:
+    """A camera that pictures of the mesh are drawn from."""
+
+    size: tuple[int, int]  # width, height [pixels]
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy [pixels]
+    T_world_camera: tuple[tuple[float, ...], ...]  # (4, 4)
+    near: float  # [m] nothing nearer is drawn
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
     """What a run did, with what, and how long it took."""
@@ -132,6 +142,10 @@ class RunRecord:
     maps: Mapping[str, MapRecord] = field(default_factory=dict)
     properties: Mapping[str, PropertyRecord] = field(default_factory=dict)
     mesh: MeshRecord | None = None
+    # (4, 4) from the world to one with z up and the floor, where it is known, at z = 0; None: not known
+    T_up_world: tuple[tuple[float, ...], ...] | None = None
+    up: str = ""  # how that was found, one of geometry.gravity.How
+    views: tuple[ViewRecord, ...] = ()  # of preview.png and the pictures of properties
     peak_memory_bytes: int = 0
     files: Mapping[str, int] = field(default_factory=dict)  # sizes [bytes]
     warnings: tuple[str, ...] = ()

@@ -9,6 +9,14 @@ from typing import Any
 from .record import FrameCounts, RunRecord
 from .tables import format_bytes, format_table
 
+HOW = {  # how up was found
+    "floor": "the floor's normal",
+    "given": "given",
+    "convention": "the axis that the cameras are level to",
+    "cameras": "a guess, the mean of the cameras' own",
+    "guess": "a guess",
+}
+
 
 def summarize(record: RunRecord, files: Sequence[str], directory: Path) -> str:
     """What a run did, and the files that it wrote."""
@@ -39,6 +47,8 @@ def summarize(record: RunRecord, files: Sequence[str], directory: Path) -> str:
     lines += ["", format_table(maps), ""]
     if mesh:
         lines.append(f"mesh     {mesh.vertices:,} vertices, {mesh.triangles:,} triangles")
+    if record.T_up_world is not None:
+        lines.append(f"up       {describe_up(record)}")
     lines += [
         f"time     {seconds.frames:.1f} s for the frames ({seconds.first_frame:.1f} s for the first, which "
         f"compiles kernels), {seconds.mesh:.1f} s for the mesh, {seconds.write:.1f} s to write",
@@ -52,6 +62,12 @@ def count_frames(frames: FrameCounts) -> str:
     """How many frames were used, and how many were not."""
     stopped = ", stopped early" if frames.interrupted else ""
     return f"{frames.used} used, {frames.skipped} skipped{stopped}"
+
+
+def describe_up(record: RunRecord) -> str:
+    """Which way is up, and how that was found."""
+    direction = " ".join(f"{number:.2f}" for number in (record.T_up_world or ((),) * 3)[2][:3])
+    return f"{direction} ({HOW.get(record.up, record.up)})"
 
 
 def tracking_lines(tracking: Mapping[str, Any] | None) -> list[str]:

@@ -11,6 +11,7 @@ from ..files.mesh_reading import read_mesh
 from ..files.trajectories import read_trajectory
 from ..maps import FeatureMap
 from ..types import Mesh, Trajectory
+from .outlook import Outlook, read_outlook
 from .run_folder import RunFolder
 
 
@@ -21,6 +22,7 @@ class Understood:
     mesh: Mesh
     features: FeatureMap
     trajectory: Trajectory | None
+    outlook: Outlook
 
 
 def read_understood(directory: Path, device: str) -> Understood:
@@ -43,5 +45,8 @@ def read_understood(directory: Path, device: str) -> Understood:
     runtime.init(device)
     poses = folder.trajectory
     return Understood(
-        mesh, FeatureMap.load(folder.features), read_trajectory(poses) if poses.exists() else None
+        mesh,
+        FeatureMap.load(folder.features),
+        read_trajectory(poses) if poses.exists() else None,
+        read_outlook(folder, mesh),
     )

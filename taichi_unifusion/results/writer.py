@@ -15,16 +15,19 @@ from typing import Any
 from ..config import dump_config
 from ..errors import InputError
 from ..files.atomic import check_writable, write_text
+from ..files.images import write_png
 from ..files.meshes import write_mesh
 from ..files.trajectories import write_trajectory
+from ..geometry.gravity import Up
 from ..pipeline import Pipeline
 from ..rendering.legend import property_mesh
 from ..rendering.look import Look
-from ..rendering.preview import render_preview
+from ..rendering.preview import draw_views
 from ..run_log import RunResult
 from ..types import Mesh
 from .folder_writer import FolderWriter
 from .measure import first_frame_seconds, measure_run
+from .outlook import Outlook, look_at_mesh
 from .property_files import looks_of, write_property_picture
 from .record import RunRecord, Seconds, Source, write_record
 from .run_folder import MESH_SUFFIXES, RunFolder
@@ -67,11 +70,12 @@ def write_results(
     recording: Source | None = None,
     tracking: Mapping[str, Any] | None = None,
     written: Sequence[Path] = (),
+    up: Up | None = None,
 ) -> Results:
     """Write everything that a run gave, the maps first.
 
     `recording` and what a tracker said, as JSON values, are kept in the record. `written` are files
-    in the folder that belong to this run and are there already.
+    in the folder that belong to this run and are there already. `up` is found where it is not given.
     """
     folder, started = prepare_results(directory), time.perf_counter()
     folder.map_folder.mkdir(exist_ok=True)
@@ -87,10 +91,11 @@ def write_results(
     extracting = time.perf_counter()
     mesh = writer.attempt(f"{folder.path}: the mesh could not be extracted", pipeline.extract_mesh)
     extracted = time.perf_counter()
+    outlook = _find_outlook(writer, mesh, run, up)
     if mesh is not None:
-        _write_mesh_files(writer, mesh, pipeline, run)
+        _write_mesh_files(writer, mesh, pipeline, run, outlook)
         for name, look in looks_of(pipeline).items():
-            _write_property(writer, mesh, name, look, pipeline, run)
+            _write_property(writer, mesh, name, look, pipeline, run, outlook)
     if not writer.failures:
         _remove_others(writer, pipeline)
     seconds = Seconds(
@@ -100,8 +105,24 @@ def write_results(
         write=round(time.perf_counter() - started - (extracted - extracting), 3),
     )
     record = measure_run(writer, pipeline, run, mesh, seconds, recording, tracking)
+    record = record if outlook is None else outlook.kept_in(record)
     writer.write(folder.record, lambda path: write_record(path, record))
     return Results(folder.path, tuple(writer.files), tuple(writer.failures), record)
+
+
+def _find_outlook(
+    writer: FolderWriter, mesh: Mesh | None, run: RunResult, up: Up | None
+) -> Outlook | None:
+    """Up and the viewpoints of pictures; None where there is nothing to look at."""
+    if mesh is None or not len(mesh.faces):
+        return None
+    outlook = writer.attempt(
+        f"{writer.folder.preview}: there is no place to draw the mesh from",
+        lambda: look_at_mesh(mesh, run.trajectory, up),
+    )
+    if outlook is not None and outlook.up.how in ("cameras", "guess"):
+        logger.info("%s", outlook.up.sentence)
+    return outlook
 
 
 def _write_maps(writer: FolderWriter, pipeline: Pipeline, run: RunResult) -> None:
@@ -136,7 +157,9 @@ def _remove_others(writer: FolderWriter, pipeline: Pipeline) -> None:
         writer.remove(file)
 
 
-def _write_mesh_files(writer: FolderWriter, mesh: Mesh, pipeline: Pipeline, run: RunResult) -> None:
+def _write_mesh_files(
+    writer: FolderWriter, mesh: Mesh, pipeline: Pipeline, run: RunResult, outlook: Outlook | None
+) -> None:
     folder = writer.folder
     wanted = {folder.mesh_file(suffix) for suffix in pipeline.config.mesh.formats}
     if not len(mesh.faces):
@@ -152,16 +175,20 @@ def _write_mesh_files(writer: FolderWriter, mesh: Mesh, pipeline: Pipeline, run:
             writer.write(file, lambda path: write_mesh(path, mesh))
         else:
             writer.remove(file)
-    if len(mesh.faces):
-        writer.write(
-            folder.preview, lambda path: render_preview(mesh, path, trajectory=run.trajectory)
-        )
+    if outlook is not None:
+        writer.write(folder.preview, lambda path: write_png(path, draw_views(mesh, outlook.views)))
     else:
         writer.remove(folder.preview)
 
 
 def _write_property(
-    writer: FolderWriter, mesh: Mesh, name: str, look: Look, pipeline: Pipeline, run: RunResult
+    writer: FolderWriter,
+    mesh: Mesh,
+    name: str,
+    look: Look,
+    pipeline: Pipeline,
+    run: RunResult,
+    outlook: Outlook | None,
 ) -> None:
     """The mesh in the colours of a property, with its values, and a picture of it with a legend."""
     folder = writer.folder
@@ -183,10 +210,10 @@ def _write_property(
             writer.write(file, lambda path: write_mesh(path, shown))
         else:
             writer.remove(file)
-    if "color" in shown.attributes:
+    if "color" in shown.attributes and outlook is not None:
         writer.write(
             folder.property_picture(name),
-            lambda path: write_property_picture(path, shown, name, look, run.trajectory),
+            lambda path: write_property_picture(path, shown, name, look, outlook.views),
         )
     else:
         writer.remove(folder.property_picture(name))

@@ -22,6 +22,7 @@ from ..files.trajectories import read_trajectory
 from ..geometry.triangles import SurfaceDistance
 from ..rendering.look import Look
 from ..rendering.mesh_checks import check_mesh
+from ..results.outlook import find_mesh_up, read_up
 from ..results.property_files import recorded_looks
 from ..results.reader import Run, read_run
 from ..results.run_folder import RunFolder
@@ -62,7 +63,7 @@ def open_scene(path: str | Path, options: SceneOptions | None = None) -> Scene:
         )
     source = path if folder is None else folder.mesh
     mesh = check_mesh(read_any_mesh(source), str(source))
-    T_up_world = np.eye(4) if folder is None else up_of(folder)
+    T_up_world = up_of(folder, mesh)
     looks = {} if folder is None else recorded_looks(folder)
     bare = Scene(path.name or str(path), (), T_up_world=T_up_world)
     layers = list(_own_layers(mesh, looks))
@@ -77,9 +78,14 @@ def open_scene(path: str | Path, options: SceneOptions | None = None) -> Scene:
     return replace(bare, meshes=(shown,), cameras=cameras)
 
 
-def up_of(folder: RunFolder) -> NDArray[np.float64]:
-    """T_up_world (4, 4) of a results folder; the identity where it does not say."""
-    return np.eye(4)
+def up_of(folder: RunFolder | None, mesh: Mesh) -> NDArray[np.float64]:
+    """T_up_world (4, 4) of a results folder, or of a mesh alone."""
+    try:
+        up = find_mesh_up(mesh, None) if folder is None else read_up(folder, mesh)
+    except FileError as error:  # of its trajectory
+        logger.warning("%s", error)
+        up = find_mesh_up(mesh, None)
+    return up.T_up_world
 
 
 def _own_layers(mesh: Mesh, looks: Mapping[str, Look]) -> Iterator[Layer]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from meshes import parallelogram
 from places import DATA
 
 from taichi_unifusion.datasets.synthetic import SyntheticRoom, look_at
@@ -32,13 +33,8 @@ def off(up: Up, R) -> float:
 
 def rectangle(corner, a, b, steps: int = 12):
     """Vertices and faces of a rectangle whose normal is a x b."""
-    s, t = (
-        axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(0, 1, steps + 1)], indexing="ij")
-    )
-    vertices = np.array(corner) + s[:, None] * np.array(a, float) + t[:, None] * np.array(b, float)
-    i = np.arange((steps + 1) ** 2).reshape(steps + 1, steps + 1)
-    p, q, r, u = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
-    return vertices, np.concatenate([np.stack([p, q, r], 1), np.stack([p, r, u], 1)])
+    mesh = parallelogram(corner, a, b, steps)
+    return mesh.vertices, mesh.faces
 
 
 def joined(*parts):

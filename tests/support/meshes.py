@@ -42,6 +42,13 @@ def rectangle(low, high, z: float, color=None, steps: int = 1) -> Mesh:
     )
 
 
+def parallelogram(corner, a, b, steps: int = 12) -> Mesh:
+    """2 steps^2 triangles of the parallelogram with edges a and b, facing a x b."""
+    flat = rectangle((0, 0), (1, 1), 0, steps=steps)
+    s, t = flat.vertices[:, :1], flat.vertices[:, 1:2]
+    return mesh_of(np.array(corner) + s * np.array(a, float) + t * np.array(b, float), flat.faces)
+
+
 def box(low, high) -> Mesh:
     """The twelve triangles of an axis-aligned box."""
     corners = [[(low, high)[k >> d & 1][d] for d in range(3)] for k in range(8)]

@@ -24,6 +24,7 @@ from taichi_unifusion.viewer.results_scene import SceneOptions, open_scene
 from taichi_unifusion.viewer.scene import Layer, Scene, SceneMesh, beside, overlaid
 
 EIGHT_BITS = 0.5 / 255 + 1e-6
+FLOOR = 0.01  # [m] off, of a floor that a Kinect saw
 EXACT = 1e-5  # [m] of float32 coordinates of a room
 ZERO, ONE = (0.0,) * 3, (1.0,) * 3
 
@@ -49,7 +50,10 @@ def test_a_results_folder_gives_every_layer_that_it_holds(scene, results):
     assert (
         shown.layer("saliency").legend.label and len(shown.layer("saliency").legend.colors) == 256
     )
-    assert np.allclose(shown.layer("height").values[:, 0], mesh.vertices[:, 2], atol=EXACT)
+    assert np.allclose(scene.T_up_world[:3, :3], np.eye(3))  # the floor's normal
+    assert abs(scene.T_up_world[2, 3]) < FLOOR
+    heights = mesh.vertices[:, 2] + scene.T_up_world[2, 3]
+    assert np.allclose(shown.layer("height").values[:, 0], heights, atol=EXACT)
     assert np.allclose(shown.layer("normals").values, mesh.normals, atol=EXACT)
 
 
