@@ -425,7 +425,7 @@ def test_one_failing_output_does_not_cost_the_others(recording, tmp_path, monkey
 
     write_mesh = results.write_mesh
     monkeypatch.setattr(results, "write_mesh", full)
-    monkeypatch.setattr(results, "render_preview", broken)
+    monkeypatch.setattr(results, "draw_views", broken)
     assert (
         cli.main(
             ["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(tmp_path)]
@@ -567,10 +567,10 @@ def test_R3_a_second_signal_stops_at_once_and_leaves_no_temporary_file(long_run)
 def test_a_signal_while_writing_finishes_the_writing(recording, tmp_path, monkeypatch, capfd):
     def interrupted(*arguments, **options):
         os.kill(os.getpid(), signal.SIGINT)
-        return render_preview(*arguments, **options)
+        return draw_views(*arguments, **options)
 
-    render_preview, before = results.render_preview, signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(results, "render_preview", interrupted)
+    draw_views, before = results.draw_views, signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(results, "draw_views", interrupted)
     assert (
         cli.main(
             ["reconstruct", "folder", str(recording), *FLAGS, "--end", "1", "--out", str(tmp_path)]
