@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+from numpy.typing import NDArray
 from tyro.conf import Positional, arg
 
 from ..config import MeshSettings
 from ..errors import FileError, InputError, UniFusionError
-from ..geometry.gravity import parse_up
+from ..geometry.gravity import Up, parse_up
 from ..results.run_folder import RunFolder
 from ..results.tables import format_bytes
 from .options import Device, UpOption
 from .terminal import report
+
+if TYPE_CHECKING:
+    from ..types import Mesh
 
 
 @dataclass(frozen=True)
@@ -77,9 +81,10 @@ def extract_mesh(options: ExtractMesh) -> int:
 
         meshes.update(property_meshes(folder, mesh))
     failures: list[Exception] = []
+    T_up_world = _upright(folder, mesh, up)
     for file, shown in meshes.items():
         try:
-            write_mesh(file, shown)
+            write_mesh(file, shown, T_up_world)
             print(
                 f"{file}: {len(shown.vertices):,} vertices, {len(shown.faces):,} triangles, "
                 f"{format_bytes(file.stat().st_size)}"
@@ -93,3 +98,15 @@ def extract_mesh(options: ExtractMesh) -> int:
         print(f"{folder.path}: {', '.join(updated.files)} follow the new mesh")
         failures += updated.failures
     return report(failures)
+
+
+def _upright(folder: RunFolder, mesh: Mesh, up: Up | None) -> NDArray | None:
+    """T_up_world, by which a GLB stands upright; None where there is nothing to stand."""
+    from ..results.outlook import read_up
+
+    if not len(mesh.faces):
+        return None
+    try:
+        return (up or read_up(folder, mesh)).T_up_world
+    except FileError:  # a damaged trajectory, which the pictures will say
+        return None

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
 from ..config import dump_config
 from ..errors import InputError
 from ..files.atomic import check_writable, write_text
@@ -125,6 +127,11 @@ def _find_outlook(
     return outlook
 
 
+def _upright(outlook: Outlook | None) -> NDArray | None:
+    """T_up_world, by which a GLB stands upright."""
+    return None if outlook is None else outlook.up.T_up_world
+
+
 def _write_maps(writer: FolderWriter, pipeline: Pipeline, run: RunResult) -> None:
     """Write every map; one that was never made, since no frame gave its values, is a failure."""
     for name, made in pipeline.maps.items():
@@ -172,7 +179,7 @@ def _write_mesh_files(
         wanted &= {folder.mesh}  # the other formats cannot hold an empty mesh
     for file in folder.meshes:
         if file in wanted:
-            writer.write(file, lambda path: write_mesh(path, mesh))
+            writer.write(file, lambda path: write_mesh(path, mesh, _upright(outlook)))
         else:
             writer.remove(file)
     if outlook is not None:
@@ -207,7 +214,7 @@ def _write_property(
     for suffix in MESH_SUFFIXES:
         file = folder.property_mesh(name, suffix)
         if suffix in pipeline.config.mesh.formats:
-            writer.write(file, lambda path: write_mesh(path, shown))
+            writer.write(file, lambda path: write_mesh(path, shown, _upright(outlook)))
         else:
             writer.remove(file)
     if "color" in shown.attributes and outlook is not None:

@@ -28,7 +28,7 @@ from taichi_unifusion.cli import main as cli
 from taichi_unifusion.cli.info import Info
 from taichi_unifusion.config import Config, dump_config, load_config
 from taichi_unifusion.files.maps import read_map
-from taichi_unifusion.files.mesh_reading import read_mesh
+from taichi_unifusion.files.mesh_reading import read_any_mesh, read_mesh
 from taichi_unifusion.files.trajectories import read_trajectory
 from taichi_unifusion.results import writer as results
 
@@ -250,9 +250,23 @@ def test_the_results_folder_holds_everything(made):
     assert len(mesh.faces) > 0 and mesh.normals is not None and "color" in mesh.attributes
     assert load_config(made / "config.yaml") == CONFIG
     assert len(read_trajectory(made / "trajectory.txt")) == 3
-    assert (made / "preview.png").read_bytes()[:4] == b"\x89PNG" and (
-        made / "mesh.glb"
-    ).read_bytes()[:4] == b"glTF"
+    assert (made / "preview.png").read_bytes()[:4] == b"\x89PNG"
+    glb = read_any_mesh(made / "mesh.glb")
+    assert np.array_equal(glb.vertices, mesh.vertices) and np.array_equal(glb.faces, mesh.faces)
+    np.testing.assert_allclose(glb.attributes["color"], mesh.attributes["color"], atol=1e-6)
+
+
+def test_the_glb_stands_upright_as_the_record_says(made, tmp_path):
+    def turn(folder):
+        data = (folder / "mesh.glb").read_bytes()
+        said = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+        return np.reshape(said["nodes"][0]["matrix"], (4, 4)).T
+
+    T_up_world = np.array(json.loads((made / "metrics.json").read_text())["T_up_world"])
+    np.testing.assert_allclose(turn(made)[1], T_up_world[2], atol=1e-9)  # y is up
+    copy = shutil.copytree(made, tmp_path / "copy")
+    assert cli.main(["mesh", str(copy), "--up", "x", "--device", DEVICE]) == 0
+    np.testing.assert_allclose(turn(copy)[1, :3], [1, 0, 0], atol=1e-9)
 
 
 def test_the_metrics_agree_with_the_files(made):
@@ -415,10 +429,10 @@ def test_a_run_that_fails_leaves_an_earlier_one_alone_and_no_empty_folder(made, 
 
 
 def test_one_failing_output_does_not_cost_the_others(recording, tmp_path, monkeypatch, capsys):
-    def full(path, mesh):
+    def full(path, mesh, *rest):
         if path.suffix == ".glb":
             raise OSError(errno.ENOSPC, "No space left on device")
-        return write_mesh(path, mesh)
+        return write_mesh(path, mesh, *rest)
 
     def broken(*arguments, **options):
         raise RuntimeError("out of ink")
