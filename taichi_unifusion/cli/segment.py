@@ -169,6 +169,7 @@ def _scores(
             }
             for score in result.classes
         ],
+        "confusion": {"labels": result.labels, "counts": result.confusion},
     }
 
 

@@ -23,6 +23,7 @@ FORMATS = {  # name -> module here, what opens a recording
     "scannet": ("scannet", "open_scannet"),
     "k4a": ("k4a", "open_k4a"),
     "folder": ("folder", "open_folder"),
+    "2d3ds": ("stanford", "open_stanford"),
     "scene": ("scene", "open_scene"),
 }
 
@@ -36,6 +37,7 @@ SENTENCES = {  # what an option of open_dataset means, the same in every format 
     "height": "Rows of an image.",
     "max_difference": "How far time stamps of depth, colour and pose may be apart, in seconds.",
     "noise": "Depth as a Kinect reads it; false: exact depth.",
+    "room": "The one room to read, as office_1, instead of the whole area.",
     "seed": "Another number gives other noise.",
     "trajectory": "File of poses to render from: lines 'timestamp tx ty tz qx qy qz qw'.",
     "width": "Columns of an image.",

@@ -50,6 +50,12 @@ class SegmentationResult:
     points: int  # compared
     ignored: int  # left out for their true label
     unlabelled: int  # compared, without a predicted label: these count as missed
+    labels: tuple[
+        int, ...
+    ]  # of the rows of `confusion`: all classes with names, if names were given
+    confusion: tuple[
+        tuple[int, ...], ...
+    ]  # points by true and given label; the last column is others
 
 
 def evaluate_segmentation(
@@ -79,31 +85,59 @@ def evaluate_segmentation(
     labels = _compared_labels(truth, names, ignore, unseen)
     kept = np.isin(truth, labels)
     predicted, truth = predicted[kept], truth[kept]
-    matrix = confusion_matrix(predicted, truth, labels)
-    right, of_truth, given = np.diag(matrix), matrix.sum(axis=1), matrix[:, :-1].sum(axis=0)
-    iou, accuracy = right / (of_truth + given - right), right / of_truth
+    return score_confusion(
+        confusion_matrix(predicted, truth, labels),
+        labels,
+        names=names,
+        unseen=unseen,
+        ignored=int((~kept).sum()),
+        unlabelled=int((predicted == UNLABELLED).sum()),
+    )
+
+
+def score_confusion(
+    matrix: NDArray[np.int64],
+    labels: NDArray[np.int64],
+    *,
+    names: Mapping[int, str] | None = None,
+    unseen: Collection[int] = (),
+    ignored: int = 0,
+    unlabelled: int = 0,
+) -> SegmentationResult:
+    """The scores of counts (C, C + 1) as `confusion_matrix` gives them for `labels` (C,).
+
+    Counts of several scenes may be added up first: the scores are then those of all their points
+    together. Raises InputError where there is no point.
+    """
+    of_truth = matrix.sum(axis=1)
+    occurs = np.flatnonzero(of_truth)
+    if not len(occurs):
+        raise InputError("segmentation: there is no point to score")
+    right, given = np.diag(matrix), matrix[:, :-1].sum(axis=0)
     classes = tuple(
         ClassScore(
-            label,
+            label := int(labels[i]),
             names[label] if names else str(label),
-            float(iou[i]),
-            float(accuracy[i]),
+            float(right[i] / (of_truth[i] + given[i] - right[i])),
+            float(right[i] / of_truth[i]),
             int(of_truth[i]),
             label not in unseen,
         )
-        for i, label in enumerate(labels.tolist())
+        for i in occurs
     )
     mean_iou, mean_accuracy = _means(classes)
     return SegmentationResult(
         mean_iou,
         mean_accuracy,
-        float(right.sum() / len(truth)),
+        float(right.sum() / of_truth.sum()),
         _group([score for score in classes if score.seen]) if unseen else None,
         _group([score for score in classes if not score.seen]),
         classes,
-        len(truth),
-        int((~kept).sum()),
-        int((predicted == UNLABELLED).sum()),
+        int(of_truth.sum()),
+        ignored,
+        unlabelled,
+        tuple(labels.tolist()),
+        tuple(map(tuple, matrix.tolist())),
     )
 
 
@@ -113,12 +147,11 @@ def _compared_labels(
     ignore: Collection[int],
     unseen: Collection[int],
 ) -> NDArray[np.int64]:
-    """The classes (C,) that are compared, sorted."""
+    """The classes (C,) that are compared, sorted: those with names, else those of the truth."""
     known = np.unique(truth)
-    labels = known[
-        ~np.isin(known, list(ignore)) & (np.isin(known, list(names)) if names is not None else True)
-    ]
-    if not len(labels):
+    labels = known if names is None else np.array(sorted(names), np.int64)
+    labels = labels[~np.isin(labels, list(ignore))]
+    if not np.isin(known, labels).any():
         raise InputError(
             f"segmentation: no point is left of {len(truth)}; every true label is ignored or has no name"
         )

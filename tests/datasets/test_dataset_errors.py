@@ -66,6 +66,7 @@ def test_missing_path(tmp_path, name):
         ("tum", "depth.txt"),
         ("scannet", "depth/N.png"),
         ("folder", "camera.yaml"),
+        ("2d3ds", "camera_UUID_ROOM_frame_N_domain_depth.png"),
     ],
 )
 def test_S4_empty_folder_names_the_pattern_searched(tmp_path, name, searched):

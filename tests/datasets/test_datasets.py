@@ -22,6 +22,7 @@ from dataset_writers import (
     write_scannet_flat,
     write_sens,
     write_seven_scenes,
+    write_stanford,
     write_tum,
 )
 
@@ -40,6 +41,7 @@ ROUND_TRIPS = {  # name -> format, writer, options, units a metre, pose toleranc
     "scannet": ("scannet", write_scannet, {}, 1000.0, TEXT_POSE),
     "scannet-flat": ("scannet", write_scannet_flat, {}, 1000.0, TEXT_POSE),
     "scannet-sens": ("scannet", write_sens, {}, 1000.0, FLOAT32_POSE),
+    "2d3ds": ("2d3ds", write_stanford, {}, 512.0, TEXT_POSE),
     "folder-poses": ("folder", partial(write_folder, poses="folder"), {}, 1000.0, TEXT_POSE),
     "folder-rows": ("folder", partial(write_folder, poses="rows"), {}, 1000.0, TEXT_POSE),
     "folder-named": ("folder", partial(write_folder, poses="named"), {}, 1000.0, TEXT_POSE),

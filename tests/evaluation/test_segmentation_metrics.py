@@ -7,6 +7,7 @@ import pytest
 
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.evaluation import evaluate_segmentation, transfer_labels
+from taichi_unifusion.evaluation.segmentation import score_confusion
 
 NAMES = {1: "wall", 2: "chair", 5: "lamp", 9: "dragon"}
 
@@ -165,3 +166,30 @@ def test_bad_labels_are_told_in_one_sentence(predicted, truth, options, told):
 def test_bad_points_are_told_in_one_sentence(points, labels, options, told):
     with pytest.raises(InputError, match=told):
         transfer_labels(points, labels, [(0, 0, 0)], **options)
+
+
+def test_added_counts_of_scenes_score_as_all_their_points_together():
+    """Also where a class is given in a scene that has none of it."""
+    rng = np.random.default_rng(3)
+    truth, given = rng.choice([1, 2, 5, 7], 300), rng.choice([-1, 1, 2, 5, 9], 300)
+    truth[:100] = rng.choice(
+        [1, 2], 100
+    )  # a scene without lamps, some of whose points are called so
+    together = evaluate_segmentation(given, truth, names=NAMES, unseen=(5,))
+    scenes = [
+        evaluate_segmentation(given[part], truth[part], names=NAMES, unseen=(5,))
+        for part in (slice(0, 100), slice(100, 300))
+    ]
+    assert {scene.labels for scene in scenes} == {(1, 2, 5, 9)}
+    counts = np.sum([scene.confusion for scene in scenes], axis=0)
+    added = score_confusion(
+        counts,
+        np.array(scenes[0].labels),
+        names=NAMES,
+        unseen=(5,),
+        ignored=sum(scene.ignored for scene in scenes),
+        unlabelled=sum(scene.unlabelled for scene in scenes),
+    )
+    assert added == together
+    with pytest.raises(InputError, match="no point to score"):
+        score_confusion(np.zeros((4, 5), int), np.array([1, 2, 5, 9]))

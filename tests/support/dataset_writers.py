@@ -4,6 +4,7 @@ of the loaders.
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from dataclasses import dataclass
@@ -206,6 +207,27 @@ def sens_bytes(
 def write_sens(folder: Path, samples: list[Sample]) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scene0000_00.sens").write_bytes(sens_bytes(samples))
+    return folder
+
+
+def write_stanford(
+    folder: Path, samples: list[Sample], room: str = "office_1", camera: PinholeCamera = CAMERA
+) -> Path:
+    """An area of 2D-3D-S; images of the same room are of one place."""
+    (folder / "data" / "pose").mkdir(parents=True, exist_ok=True)
+    # as their K has it: pixels begin at whole numbers
+    K = camera.matrix + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    for i, sample in enumerate(samples):
+        name = f"camera_{'0' * 31}{i}_{room}_frame_{i}_domain"
+        write_image(folder / "data" / "rgb" / f"{name}_rgb.png", sample.color)
+        write_image(folder / "data" / "depth" / f"{name}_depth.png", sample.units)
+        pose = {
+            "camera_k_matrix": K.tolist(),
+            "camera_rt_matrix": np.linalg.inv(sample.T_world_camera)[:3].tolist(),
+            "camera_location": sample.T_world_camera[:3, 3].tolist(),
+            "room": f"{room}_1",
+        }
+        (folder / "data" / "pose" / f"{name}_pose.json").write_text(json.dumps(pose))
     return folder
 
 
