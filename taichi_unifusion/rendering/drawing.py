@@ -19,7 +19,8 @@ SHADING = {True: 0.22, False: 0.6}
 # direction to the light, camera frame: above, a little left, behind the camera
 LIGHT = (-0.35, -0.75, -0.55)
 OCCLUSION_RADIUS = 0.25  # [m] of ambient occlusion
-OCCLUSION_TAPS = 4  # per sample; the four samples of a pixel look in different directions
+OCCLUSION_TAPS = 6  # depths looked at for the samples of a pixel that see one surface
+LOOKED_AT = 960  # samples of a row that are enough to find it: they stay within the cache
 SAMPLES = 2  # per pixel and axis
 
 
@@ -84,9 +85,12 @@ class Drawable:
         """Picture (H, W, 3) RGB of the sides that face the camera."""
         camera = view.camera.resized(view.camera.width * SAMPLES, view.camera.height * SAMPLES)
         drawn = self.depth_buffer(replace(view, camera=camera))
-        from .kernels.raster import shade_pixels
+        from .kernels.raster import shade_pixels, thin_out
 
         image = np.empty((view.camera.height, view.camera.width, 3), np.uint8)
+        thinned = max(1, camera.width // LOOKED_AT)
+        depth = np.empty((-(-camera.height // thinned), -(-camera.width // thinned)), np.float32)
+        thin_out(drawn.nearest, thinned, depth)
         light = np.array(LIGHT) / np.linalg.norm(LIGHT)
         shade_pixels(
             self.vertices,
@@ -97,6 +101,8 @@ class Drawable:
             np.linalg.inv(view.T_world_camera)[:3],
             camera.intrinsics,
             drawn.nearest,
+            depth,
+            thinned,
             (*light, self.shading),
             OCCLUSION_RADIUS,
             OCCLUSION_TAPS,

@@ -55,9 +55,9 @@ def test_rasterize_equals_its_twin(count, spread, two_sided):
 @pytest.mark.parametrize("radius", [1e-9, 0.4])
 def test_shade_pixels_equals_its_twin(radius):
     """Nothing occludes within a nanometre: there every pixel agrees."""
-    from taichi_unifusion.rendering.kernels.raster import shade_pixels
+    from taichi_unifusion.rendering.kernels.raster import shade_pixels, thin_out
 
-    samples, (vertices, faces) = 2, soup(150, 0.6, seed=1)
+    samples, thinned, (vertices, faces) = 2, 4, soup(150, 0.6, seed=1)
     finer = CAMERA.resized(CAMERA.width * samples, CAMERA.height * samples)
     buffer = drawn(vertices, faces, finer, two_sided=False)
     rng = np.random.default_rng(2)
@@ -71,6 +71,9 @@ def test_shade_pixels_equals_its_twin(radius):
         "taps": 4,
         "background": (0.9, 0.8, 0.7),
     }
+    depth = np.empty((-(-finer.height // thinned), -(-finer.width // thinned)), np.float32)
+    thin_out(buffer.nearest, thinned, depth)
+    np.testing.assert_array_equal(depth, buffer.depth(0.0)[::thinned, ::thinned])
     image = np.empty((CAMERA.height, CAMERA.width, 3), np.uint8)
     shade_pixels(
         vertices,
@@ -81,6 +84,8 @@ def test_shade_pixels_equals_its_twin(radius):
         np.linalg.inv(pose())[:3],
         finer.intrinsics,
         buffer.nearest,
+        depth,
+        thinned,
         (*light, look["shading"]),
         look["radius"],
         look["taps"],
@@ -98,6 +103,7 @@ def test_shade_pixels_equals_its_twin(radius):
         buffer.depth(0.0).astype(float),
         look,
         samples,
+        thinned,
     )
     error = np.abs(image - expected).max(axis=2)
     assert (buffer.triangle() >= 0).mean() > 0.2

@@ -10,6 +10,7 @@ from taichi_unifusion.rendering.kernels.raster import (
     OCCLUSION_BIAS,
     OCCLUSION_GAIN,
     OCCLUSION_SHARE,
+    ONE_SURFACE,
 )
 from taichi_unifusion.types import PinholeCamera
 
@@ -60,15 +61,18 @@ def rasterize(
 
 
 def shade_pixels(
-    vertices, normals, colors, faces, camera, T_world_camera, seen, depth, look, samples
+    vertices, normals, colors, faces, camera, T_world_camera, seen, depth, look, samples, thinned
 ):
     """Colour (H, W, 3) of every pixel, 0..255, whose samples see triangles `seen` at `depth`, both
-    (samples H, samples W) of `camera`. `look` has light, shading, radius, taps and background.
+    (samples H, samples W) of `camera`. `look` has light, shading, radius, taps and background. What
+    is hidden is looked up in every `thinned`-th sample, and shared by samples of one surface.
     """
     image = np.zeros((*seen.shape, 3))
     rays, local = camera.rays(), in_camera(vertices, T_world_camera)
     R_camera_world = T_world_camera[:3, :3].T
+    hidden = np.zeros((seen.shape[0] // samples, seen.shape[1] // samples, 2))  # and where, [m]
     for v, u in np.ndindex(seen.shape):
+        pixel = v // samples, u // samples
         image[v, u] = look["background"]
         if seen[v, u] >= 0:
             corner = faces[seen[v, u]]
@@ -79,24 +83,30 @@ def shade_pixels(
             lit = (0.5 + 0.5 * n @ look["light"]) * LIFT
             image[v, u] = w @ colors[corner]
             image[v, u] *= 1 - look["shading"] + look["shading"] * lit
-            image[v, u] *= 1 - OCCLUSION_SHARE * occlusion(seen, depth, v, u, n, camera, look)
+            if abs(depth[v, u] - hidden[pixel][1]) > ONE_SURFACE * depth[v, u]:
+                share = occlusion(depth, v, u, n, camera, look, thinned)
+                hidden[pixel] = share, depth[v, u]
+            image[v, u] *= 1 - OCCLUSION_SHARE * hidden[pixel][0]
     height, width = (size // samples for size in seen.shape)
     blocks = np.clip(image, 0, 1).reshape(height, samples, width, samples, 3)
     return 255 * blocks.mean(axis=(1, 3))
 
 
-def occlusion(seen, depth, v, u, n, camera, look) -> float:
+def occlusion(depth, v, u, n, camera, look, thinned) -> float:
     """How much of the sky over a sample its surroundings hide, 0..1."""
     rays, radius, taps = camera.rays(), look["radius"], look["taps"]
     at = depth[v, u] * rays[v, u]
-    reach = min(radius * camera.fx / depth[v, u], 0.25 * seen.shape[1])  # [px]
+    reach = min(
+        radius * camera.fx / depth[v, u], 0.25 * -(-depth.shape[1] // thinned) * thinned
+    )  # [px]
     turn = 2 * np.pi * np.modf(52.9829189 * np.modf(0.06711056 * u + 0.00583715 * v)[0])[0]
     hidden = 0.0
     for k in range(taps):
         r, angle = reach * (k + 0.5) / taps, turn + k * GOLDEN_ANGLE
-        y = int(np.clip(np.rint(v + r * np.sin(angle)), 0, seen.shape[0] - 1))
-        x = int(np.clip(np.rint(u + r * np.cos(angle)), 0, seen.shape[1] - 1))
-        if seen[y, x] >= 0:
+        last_y, last_x = ((size - 1) // thinned for size in depth.shape)
+        y = int(np.clip(np.rint((v + r * np.sin(angle)) / thinned), 0, last_y)) * thinned
+        x = int(np.clip(np.rint((u + r * np.cos(angle)) / thinned), 0, last_x)) * thinned
+        if depth[y, x] > 0:
             d = depth[y, x] * rays[y, x] - at
             length = np.linalg.norm(d) + 1e-6
             hidden += max(0.0, n @ d / length - OCCLUSION_BIAS) * max(0.0, 1 - length / radius)

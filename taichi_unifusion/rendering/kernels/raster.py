@@ -6,6 +6,8 @@ none has to be clipped: the pixel ray q = (u, v, 1) meets it where q . (p1 x p2)
 integer, so that the result does not depend on the order of threads.
 """
 
+import math
+
 import taichi as ti
 
 from ...kernels.arrays import Floats2, Ints2, row3
@@ -14,6 +16,8 @@ from ...kernels.camera import Intrinsics, Pose, ray, rotate
 EMPTY = (1 << 63) - 1  # depth buffer value where no triangle is seen
 EDGE = 1e-7  # barycentric slack: pixels on a shared edge belong to both triangles, never to none
 GOLDEN_ANGLE = 2.3999632
+ONE_SURFACE = 0.02  # relative difference of depth between samples of one surface in a pixel
+COS, SIN = math.cos(GOLDEN_ANGLE), math.sin(GOLDEN_ANGLE)
 
 # Half Lambert under one light, and ambient occlusion: both mild, so that colours stay true
 LIFT = 1.15  # factor that gives a surface at 60 degrees to the light about its own colour
@@ -125,31 +129,48 @@ def depth_of(value: ti.i64) -> ti.f32:
     return ti.bit_cast(ti.cast(value >> 32, ti.i32), ti.f32)
 
 
+@ti.kernel
+def thin_out(
+    # in:
+    nearest: DepthBuffer,  # (H, W)
+    thinned: ti.i32,
+    # out:
+    depth: Floats2,  # (h, w) [m] of every `thinned`-th pixel, 0 where no triangle is seen
+):
+    """A small depth image: looking around in it stays within the cache."""
+    for v, u in depth:
+        value = nearest[v * thinned, u * thinned]
+        depth[v, u] = 0.0 if value == ti.i64(EMPTY) else depth_of(value)
+
+
 @ti.func
 def occlusion(
-    nearest: ti.template(),
+    depth: ti.template(),
     v: ti.i32,
     u: ti.i32,
+    z: ti.f32,
     n: ti.math.vec3,
     intrinsics: Intrinsics,
     radius: ti.f32,
     taps: ti.i32,
+    thinned: ti.i32,
 ) -> ti.f32:
     """How much of the sky over a pixel's surface its surroundings within `radius` [m] hide, 0..1 (n
-    in the camera frame).
+    in the camera frame); these are looked up in every `thinned`-th pixel.
     """
-    z = depth_of(nearest[v, u])
     at = z * ray(u, v, intrinsics)
-    reach = ti.min(radius * intrinsics[0] / z, 0.25 * nearest.shape[1])  # [px]
+    reach = ti.min(radius * intrinsics[0] / z, 0.25 * depth.shape[1] * thinned)  # [px]
     # a start angle for each pixel, so that few taps give noise rather than bands
     turn = 6.2831853 * ti.math.fract(52.9829189 * ti.math.fract(0.06711056 * u + 0.00583715 * v))
+    way = ti.Vector([ti.cos(turn), ti.sin(turn)])  # of a tap; the next one is a golden angle on
     hidden = 0.0
     for k in range(taps):
-        r, angle = reach * (k + 0.5) / taps, turn + k * GOLDEN_ANGLE
-        y = ti.math.clamp(ti.round(v + r * ti.sin(angle), ti.i32), 0, nearest.shape[0] - 1)
-        x = ti.math.clamp(ti.round(u + r * ti.cos(angle), ti.i32), 0, nearest.shape[1] - 1)
-        if nearest[y, x] != ti.i64(EMPTY):
-            d = depth_of(nearest[y, x]) * ray(x, y, intrinsics) - at
+        r = reach * (k + 0.5) / taps
+        y = ti.math.clamp(ti.round((v + r * way[1]) / thinned, ti.i32), 0, depth.shape[0] - 1)
+        x = ti.math.clamp(ti.round((u + r * way[0]) / thinned, ti.i32), 0, depth.shape[1] - 1)
+        way = ti.Vector([COS * way[0] - SIN * way[1], SIN * way[0] + COS * way[1]])
+        if depth[y, x] > 0.0:
+            d = depth[y, x] * ray(x * thinned, y * thinned, intrinsics) - at
             length = d.norm() + 1e-6
             hidden += ti.max(0.0, n.dot(d) / length - OCCLUSION_BIAS) * ti.max(
                 0.0, 1.0 - length / radius
@@ -168,6 +189,8 @@ def shade_pixels(
     T_camera_world: Pose,  # (3, 4)
     intrinsics: Intrinsics,  # of the depth buffer
     nearest: DepthBuffer,  # (s H, s W)
+    depth: Floats2,  # (h, w) [m] of every `thinned`-th pixel of it, 0: none
+    thinned: ti.i32,
     light: ti.math.vec4,  # unit direction to it, camera frame; how much it changes colours, 0..1
     radius: ti.f32,  # of ambient occlusion [m]
     taps: ti.i32,  # depths looked at for it, a sample
@@ -181,6 +204,7 @@ def shade_pixels(
     s = nearest.shape[0] // image.shape[0]
     for y, x in ti.ndrange(image.shape[0], image.shape[1]):
         total = ti.math.vec3(0.0)
+        hidden, hidden_at = 0.0, 0.0  # samples of one surface share what is hidden at the first
         for i, j in ti.ndrange(s, s):
             v, u = y * s + i, x * s + j
             rgb = background
@@ -201,7 +225,10 @@ def shade_pixels(
                 n = rotate(T_camera_world, n)
                 n /= n.norm() + 1e-9
                 lit = 0.5 + 0.5 * n.dot(light.xyz)  # half Lambert: nothing falls into black
-                hidden = occlusion(nearest, v, u, n, intrinsics, radius, taps)
+                z = depth_of(nearest[v, u])
+                if ti.abs(z - hidden_at) > ONE_SURFACE * z:
+                    hidden = occlusion(depth, v, u, z, n, intrinsics, radius, taps, thinned)
+                    hidden_at = z
                 rgb *= 1.0 - light[3] + light[3] * lit * LIFT
                 rgb *= 1.0 - OCCLUSION_SHARE * hidden
             total += ti.math.clamp(rgb, 0.0, 1.0)
