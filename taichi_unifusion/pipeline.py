@@ -13,6 +13,7 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import runtime
 from .config import Config
@@ -216,16 +217,27 @@ class Pipeline:
         log.add_flush(self._flush())
         return log.result(interrupted, failure)
 
-    def extract_mesh(self, resolution: int | None = None) -> Mesh:
+    def extract_mesh(
+        self,
+        resolution: int | None = None,
+        *,
+        blocks: NDArray[np.int32] | None = None,
+        flush: bool = True,
+    ) -> Mesh:
         """The mesh of all that was fused so far, coloured; `resolution` overrides the
         configuration's.
+
+        With `blocks` (M, 3), what lies in these, small parts too; without `flush`, frames that wait to
+        be fused are left out: see `SurfaceMap.extract_mesh`.
         """
-        mesh = self.config.mesh
+        settings = self.config.mesh
         return extract_mesh(
             self.surface,
             self.properties,
-            mesh.resolution if resolution is None else resolution,
-            mesh.min_area,
+            settings.resolution if resolution is None else resolution,
+            settings.min_area if blocks is None else 0.0,
+            blocks=blocks,
+            flush=flush,
         )
 
 
@@ -245,12 +257,17 @@ def extract_mesh(
     properties: Mapping[str, PropertyMap],
     resolution: int,
     min_area: float = 0.0,
+    *,
+    blocks: NDArray[np.int32] | None = None,
+    flush: bool = True,
 ) -> Mesh:
-    """The surface as a mesh that carries every property that has data."""
-    mesh = surface.extract_mesh(resolution, min_area)
+    """The surface as a mesh that carries every property that has data; `blocks` and `flush` as in
+    `SurfaceMap.extract_mesh`.
+    """
+    mesh = surface.extract_mesh(resolution, min_area, blocks=blocks, flush=flush)
     for name, source in properties.items():
-        if len(source) and len(mesh.vertices):
-            mesh = mesh.with_attribute(name, source.query(mesh.vertices))
+        if len(source.grid) and len(mesh.vertices):
+            mesh = mesh.with_attribute(name, source.query(mesh.vertices, flush=flush))
     return mesh
 
 

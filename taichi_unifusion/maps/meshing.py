@@ -9,6 +9,7 @@ latents.
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
 # a lattice point as one integer, of the same order: its three indices and their offset
 CODE_BITS, CODE_OFFSET = 21, 1 << 20
 CODE_STEPS = np.array([1 << 2 * CODE_BITS, 1 << CODE_BITS, 1])  # of one point along x, y and z
+MESH_BLOCK = 16  # cubes along a block of the mesh
+# a voxel counts in the cubes of its own number and the next; normals change in those beside them
+REACHES = (-1, 2)
 SNAP = 1e-4  # of an edge: a cut this near to a vertex goes through it
 NORMAL_UNIT = float(1 << 18)  # fixed-point one of summed normals, in squared grid spacings
 
@@ -41,14 +45,15 @@ def extract_mesh(
     resolution: int,
     support_closing: int,
     min_evidence: float,
+    blocks: NDArray[np.int32] | None = None,
 ) -> Mesh:
     """Zero level of the blended field on `resolution`^3 cells a voxel, only where cells are
-    supported.
+    supported; all of it, or what lies in `blocks` (M, 3) of MESH_BLOCK^3 cubes.
 
     A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map
     holds evidence, the mesh ends on the line where evidence falls below `min_evidence`.
     """
-    codes, support = _cubes(grid, support_closing, resolution)
+    codes, support = _cubes(grid, support_closing, resolution, blocks)
     if not len(codes):
         return Mesh(
             np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32)
@@ -63,17 +68,41 @@ def extract_mesh(
         *grid_basis(encoding, resolution),
         sdf,
     )
-    vertices, faces = _march(keys, upper, support, sdf, resolution, voxel_size)
+    vertices, faces, triangles = _march(keys, upper, support, sdf, resolution, voxel_size)
+    wanted = None if blocks is None else np.repeat(_lie_in(keys, blocks), triangles)  # (F,)
     if "evidence" in grid and len(faces):
         evidence = np.empty(len(vertices), np.float32)
         interpolate_evidence(
             vertices, 1.0 / voxel_size, grid.index, grid["masks"], grid["evidence"], evidence
         )
-        vertices, faces = cut_mesh(vertices, faces, evidence - np.float32(min_evidence))
+        vertices, faces, source = cut_mesh(vertices, faces, evidence - np.float32(min_evidence))
+        wanted = None if wanted is None else wanted[source]
     sums = np.zeros((len(vertices), 3), np.int32)
     if len(faces):
         kernels.sum_normals(vertices, faces, NORMAL_UNIT * (resolution / voxel_size) ** 2, sums)
-    return Mesh(vertices, faces, _unit(sums))
+    normals = _unit(sums)
+    if wanted is not None:  # the cubes around a block were there for the normals on its border
+        faces = np.compress(wanted, faces, axis=0)
+        used = _used(faces, len(vertices))
+        normals = np.compress(used, normals, axis=0)
+        vertices, faces = _without_unused(vertices, faces)
+    return Mesh(vertices, faces, normals)
+
+
+def mesh_blocks(keys: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The blocks (M, 3), in order, whose mesh may depend on the voxels `keys` (N, 3)."""
+    corners = [_codes(_blocks(keys + reach)) for reach in product(REACHES, repeat=3)]
+    return _keys(np.unique(np.concatenate(corners)))
+
+
+def _blocks(keys: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The block (N, 3) that each cube (N, 3) lies in."""
+    return keys // MESH_BLOCK
+
+
+def _lie_in(keys: NDArray[np.int32], blocks: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Which cubes (N, 3) lie in one of the blocks."""
+    return np.isin(_codes(_blocks(keys)), _codes(blocks))
 
 
 def _unit(sums: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -87,15 +116,15 @@ def _unit(sums: NDArray[np.int32]) -> NDArray[np.float32]:
 
 def cut_mesh(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], values: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """The part of a mesh where `values` (V,), linear on every triangle, are not negative; triangles
-    on the border are cut.
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.intp]]:
+    """The part of a mesh where `values` (V,), linear on every triangle, are not negative, and the
+    face that each of its own comes from; triangles on the border are cut.
     """
     inside = values >= 0
     a, b, c = (inside.view(np.uint8).take(faces[:, k]) for k in range(3))
     corners = a + b + c  # that stay
     if (corners == 3).all():
-        return vertices, faces
+        return vertices, faces, np.arange(len(faces))
     crossed = np.flatnonzero((corners > 0) & (corners < 3))
     one_in = corners[crossed] == 1
     odd_in = _odd_first(faces[crossed[one_in]], inside)  # the first stays
@@ -122,12 +151,14 @@ def cut_mesh(
         ]
     )
     # what a cut through a corner makes of a triangle
-    pieces = pieces[(pieces != pieces[:, [2, 0, 1]]).all(axis=1)]
-    whole = np.compress(corners == 3, faces, axis=0)
-    return _without_unused(
+    proper = (pieces != pieces[:, [2, 0, 1]]).all(axis=1)
+    whole, out = np.flatnonzero(corners == 3), crossed[~one_in]
+    source = np.concatenate([whole, np.concatenate([crossed[one_in], out, out])[proper]])
+    vertices, faces = _without_unused(
         np.concatenate([vertices, on_edges]).astype(np.float32, copy=False),
-        np.concatenate([whole, pieces.astype(np.int32)]),
+        np.concatenate([faces.take(whole, axis=0), pieces[proper].astype(np.int32)]),
     )
+    return vertices, faces, source
 
 
 def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -141,8 +172,13 @@ def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.i
 def _without_unused(
     vertices: NDArray[np.float32], faces: NDArray[np.int32]
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    used = np.bincount(faces.reshape(-1), minlength=len(vertices)) > 0
+    used = _used(faces, len(vertices))
     return np.compress(used, vertices, axis=0), _ranks(used).take(faces)
+
+
+def _used(faces: NDArray[np.int32], vertices: int) -> NDArray[np.bool_]:
+    """Which of so many vertices a face has."""
+    return np.bincount(faces.reshape(-1), minlength=vertices) > 0
 
 
 def _ranks(chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -178,12 +214,19 @@ def connected_parts(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32
 
 
 def _cubes(
-    grid: VoxelGrid, support_closing: int, resolution: int
+    grid: VoxelGrid,
+    support_closing: int,
+    resolution: int,
+    blocks: NDArray[np.int32] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
-    """Sorted codes (Q,) of the cubes that hold surface or close one that does, and their support
-    masks (Q, 2).
+    """Sorted codes (Q,) of the cubes that hold surface or close one that does, in or beside
+    `blocks`, and their support masks (Q, 2).
     """
     codes = _with_upper(np.sort(_codes(grid.voxel_keys())))
+    if blocks is not None:
+        keys = _keys(codes)
+        beside = [_lie_in(keys + step, blocks) for step in product((-1, 1), repeat=3)]
+        codes = np.compress(np.any(beside, axis=0), codes)
     support = np.empty((len(codes), 2), np.uint32)
     if len(codes):
         query.corner_support(_keys(codes), grid.index, grid["masks"], support_closing, support)
@@ -273,8 +316,10 @@ def grid_basis(
 
 def _march(
     keys, upper, support, sdf, resolution, voxel_size
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Vertices (V, 3) world [m] and faces (F, 3) of the zero level."""
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]]:
+    """Vertices (V, 3) world [m] and faces (F, 3) of the zero level, and how many faces each cube
+    has (Q,).
+    """
     triangle_counts, flags, table, edge_table = marching_cubes_tables()
     cases, edges = np.zeros(sdf.shape, np.uint8), np.zeros(sdf.shape, np.int32)
     counts = np.empty((len(keys), 2), np.int32)  # vertices, triangles
@@ -302,4 +347,4 @@ def _march(
             vertices,
             faces,
         )
-    return vertices, faces
+    return vertices, faces, counts[:, 1]

@@ -83,24 +83,25 @@ class PropertyMap(RegressionMap[PropertySettings]):
 
     @overload
     def query(
-        self, points: NDArray, return_valid: Literal[False] = False
+        self, points: NDArray, return_valid: Literal[False] = False, *, flush: bool = True
     ) -> NDArray[np.float32]: ...
 
     @overload
     def query(
-        self, points: NDArray, return_valid: Literal[True]
+        self, points: NDArray, return_valid: Literal[True], *, flush: bool = True
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]: ...
 
     def query(
-        self, points: NDArray, return_valid: bool = False
+        self, points: NDArray, return_valid: bool = False, *, flush: bool = True
     ) -> NDArray[np.float32] | tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Property values (N, c) float32 at points (N, 3) world [m]; optionally also where (N,) a
         voxel covers the point.
 
         Elsewhere the value is that of the nearest voxel within two, so that a mesh has no black
-        rims, and 0 beyond.
+        rims, and 0 beyond. Without `flush`, frames that wait to be fused are left out.
         """
-        self.flush()
+        if flush:
+            self.flush()
         runtime.check_alive(self.grid.runtime)
         values, valid = self.decoder.decode(self.grid, points, self.settings.blend, NEAREST_REACH)
         return (values, valid) if return_valid else values

@@ -170,19 +170,37 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         values, valid = self.decoder.decode(self.grid, points, blend=True, reach=0)
         return values[:, 0] * np.float32(self.voxel_size), valid
 
-    def extract_mesh(self, resolution: int = 4, min_area: float = 0.0) -> Mesh:
+    def extract_mesh(
+        self,
+        resolution: int = 4,
+        min_area: float = 0.0,
+        *,
+        blocks: NDArray[np.int32] | None = None,
+        flush: bool = True,
+    ) -> Mesh:
         """The zero level by marching cubes on `resolution`^3 cells a voxel; an empty mesh where
         nothing was integrated.
 
-        Connected parts of less than `min_area` square metres are left out. Raises InputError for a
-        resolution outside 1..32.
+        Connected parts of less than `min_area` square metres are left out. With `blocks` (M, 3), only
+        what lies in these, cubes of 16 voxels' edge, as `changed_blocks` gives them; all blocks
+        together are the whole mesh, vertices on their borders and normals there included. Without
+        `flush`, frames that wait to be fused are left out.
+
+        Raises InputError for a resolution outside 1..32, and where both `min_area` and `blocks` are
+        given.
         """
-        self.flush()
+        if flush:
+            self.flush()
         runtime.check_alive(self.grid.runtime)
         if not 1 <= resolution <= MAX_RESOLUTION:
             raise InputError(
                 f"extract_mesh: resolution must lie in 1..{MAX_RESOLUTION} cells a voxel, got "
                 f"{resolution}"
+            )
+        if blocks is not None and min_area > 0:
+            raise InputError(
+                "extract_mesh: min_area needs the whole mesh, since blocks cut parts in pieces: leave "
+                "one of min_area and blocks out"
             )
         mesh = extract_mesh(
             self.grid,
@@ -191,5 +209,6 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
             resolution,
             self.settings.support_closing,
             self.settings.min_evidence,
+            blocks,
         )
         return drop_small_parts(mesh, min_area)

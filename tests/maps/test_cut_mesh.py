@@ -29,8 +29,16 @@ def sheet():
     )
 
 
+def assert_within(sheet, source, points) -> None:
+    """Each point (N, 3) lies in the face of the sheet that it is said to come from."""
+    a, b, c = np.moveaxis(sheet[0][sheet[1][source]].astype(float), 1, 0)
+    whole = np.cross(b - a, c - a)[:, 2]
+    for p, q in ((a, b), (b, c), (c, a)):
+        assert (np.cross(q - p, points - p)[:, 2] >= -1e-6 * whole).all()
+
+
 def assert_cut(sheet, values, area: float) -> None:
-    vertices, faces = cut_mesh(*sheet, values.astype(np.float32))
+    vertices, faces, source = cut_mesh(*sheet, values.astype(np.float32))
     assert_welded(vertices, faces)
     assert (
         vertices.dtype == np.float32
@@ -38,6 +46,7 @@ def assert_cut(sheet, values, area: float) -> None:
         and len(np.unique(vertices, axis=0)) == len(vertices)
     )
     a, b, c = (vertices[faces[:, k]].astype(float) for k in range(3))
+    assert_within(sheet, source, (a + b + c) / 3)
     doubled = np.cross(b - a, c - a)
     assert (doubled[:, 2] > -1e-9).all() and doubled[:, 2].sum() / 2 == pytest.approx(
         area, rel=AREA
@@ -83,5 +92,8 @@ def test_a_mesh_of_one_sign_is_kept_or_gone(sheet):
     vertices, faces = sheet
     kept = cut_mesh(vertices, faces, np.zeros(len(vertices), np.float32))
     assert kept[0] is vertices and kept[1] is faces
+    np.testing.assert_array_equal(kept[2], np.arange(len(faces)))
     gone = cut_mesh(vertices, faces, np.full(len(vertices), -1, np.float32))
-    assert gone[0].shape == gone[1].shape == (0, 3) and gone[1].dtype == np.int32
+    assert (
+        gone[0].shape == gone[1].shape == (0, 3) and len(gone[2]) == 0 and gone[1].dtype == np.int32
+    )

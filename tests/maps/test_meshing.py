@@ -42,7 +42,8 @@ def cubes_of(field: np.ndarray, first=(0, 0, 0), keep=None):
 
 def march(field: np.ndarray, first=(0, 0, 0)):
     keys, upper, samples = cubes_of(field, first)
-    return meshing._march(keys, upper, np.full((len(keys), 2), ALL, np.uint32), samples, R, VS)
+    support = np.full((len(keys), 2), ALL, np.uint32)
+    return meshing._march(keys, upper, support, samples, R, VS)[:2]
 
 
 # ---- Tables ----
@@ -172,7 +173,7 @@ def test_emit_mesh_equals_its_twin(patchy):
     vertices of its own edges.
     """
     keys, upper, samples, support, whole = patchy
-    vertices, faces = meshing._march(keys, upper, support, samples, R, VS)
+    vertices, faces, _ = meshing._march(keys, upper, support, samples, R, VS)
     edge_table = meshing.marching_cubes_tables()[3]
     places, wanted = reference.emit_mesh(
         whole, twin_cases(patchy), R, np.array([-1, 5, 0]), VS, triangles_of, edge_table
@@ -188,7 +189,7 @@ def test_emit_mesh_equals_its_twin(patchy):
 
 def test_sum_normals_equals_its_twin(patchy):
     keys, upper, samples, support, _ = patchy
-    vertices, faces = meshing._march(keys, upper, support, samples, R, VS)
+    vertices, faces, _ = meshing._march(keys, upper, support, samples, R, VS)
     sums, per_area = np.zeros((len(vertices), 3), np.int32), meshing.NORMAL_UNIT * (R / VS) ** 2
     kernels.sum_normals(vertices, faces, per_area, sums)
     np.testing.assert_allclose(
