@@ -24,7 +24,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # K2; of processor time, the best of three: so that other programs on the machine do not decide
 MAX_IMPORT_S = 1.5
 # each more than a second of import, none needed to reconstruct
-HEAVY = {"torch", "open3d", "trimesh"}
+HEAVY = {"torch", "open3d", "trimesh", "viser", "fast_simplification"}
 MAX_FILE_BYTES = 1 << 20
 MAX_REPOSITORY_BYTES = 6 << 20
 IMPORT_NAMES = {

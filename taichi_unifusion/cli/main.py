@@ -35,6 +35,7 @@ from .segment import Segment, segment
 from .terminal import DONE, FAILED, log_to_stderr, report
 from .transfer import Transfer, transfer
 from .understand import Understand, understand
+from .view import View, view
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +53,7 @@ COMMANDS: Commands = {
     "understand": (Understand, understand),
     "query": (Query, query),
     "segment": (Segment, segment),
+    "view": (View, view),
     "mesh": (ExtractMesh, extract_mesh),
     "info": (Info, info),
     "config": (ShowConfig, show_config),

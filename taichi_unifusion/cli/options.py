@@ -101,7 +101,7 @@ class OutputOptions:
 
 
 @dataclass(frozen=True)
-class TextOptions:
+class EncoderOptions:
     """What turns words into vectors, for questions to a map of features."""
 
     text: Annotated[
@@ -124,10 +124,16 @@ class TextOptions:
     """Allow a CLIP model to be fetched from the Hugging Face hub; without it only what lies on this
     machine is used.
     """
-    json: FlagCreatePairsOff[bool] = False
-    """Print JSON instead of tables."""
     device: Device = "auto"
     """Where to compute."""
+
+
+@dataclass(frozen=True)
+class TextOptions(EncoderOptions):
+    """What turns words into vectors, and how answers are printed."""
+
+    json: FlagCreatePairsOff[bool] = False
+    """Print JSON instead of tables."""
 
 
 @dataclass(frozen=True)

@@ -6,20 +6,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
-from .options import TextOptions
+from .options import EncoderOptions
 
 if TYPE_CHECKING:
     from ..networks.encoders import TextEncoder
 
 
-def templates_of(options: TextOptions) -> tuple[str, ...]:
+def templates_of(options: EncoderOptions) -> tuple[str, ...]:
     """The templates asked for, or the usual ones."""
     from ..language.prompts import TEMPLATES
 
     return options.template or TEMPLATES
 
 
-def make_encoder(options: TextOptions, source: str, directory: Path) -> TextEncoder:
+def make_encoder(options: EncoderOptions, source: str, directory: Path) -> TextEncoder:
     """The text encoder asked for, or the one that belongs to features of `source`; InputError where
     there is none.
     """

@@ -52,13 +52,15 @@ class RayCaster:
     def __init__(self, mesh: Mesh, name: str = "mesh") -> None:
         self.mesh = check_mesh(mesh, name)
 
-    def cast(self, camera: PinholeCamera, T_world_camera: NDArray) -> RayHits:
-        """What every pixel of the camera sees; raises PoseError for a pose that is no rigid
-        transform.
+    def cast(
+        self, camera: PinholeCamera, T_world_camera: NDArray, *, two_sided: bool = True
+    ) -> RayHits:
+        """What every pixel of the camera sees, of sides that face away too unless `two_sided` is
+        False; raises PoseError for a pose that is no rigid transform.
         """
         T_world_camera = check_rigid(T_world_camera)
         drawn = draw_depth_buffer(
-            self.mesh.vertices, self.mesh.faces, camera, T_world_camera, NEAR, two_sided=True
+            self.mesh.vertices, self.mesh.faces, camera, T_world_camera, NEAR, two_sided=two_sided
         )
         return RayHits(drawn.depth(nothing=np.inf), drawn.triangle(), camera, T_world_camera)
 

@@ -122,6 +122,15 @@ class RunFolder:
         return self.segmentation.with_suffix(".png")
 
     @property
+    def page(self) -> Path:
+        """The mesh as a page that opens in any browser, without a server."""
+        return self.path / "page.html"
+
+    def part(self, number: int) -> Path:
+        """A part of the mesh that somebody cut out."""
+        return self.path / f"part-{number}.ply"
+
+    @property
     def tracking_files(self) -> tuple[Path, ...]:
         """What a tracker leaves."""
         return self.tracking, self.tracked_poses

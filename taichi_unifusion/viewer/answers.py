@@ -5,7 +5,7 @@ found, and a list of them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,14 @@ class ShownAnswer:
     labels: tuple[Label, ...]
     rows: tuple[str, ...]  # one a box: rank, score, area and size in words
     sentence: str  # what was found, or that nothing was
+
+    def moved(self, by: NDArray) -> ShownAnswer:
+        """The same answer elsewhere in the scene, (3,) [m]."""
+        return replace(
+            self,
+            boxes=tuple(replace(box, corners=box.corners + by) for box in self.boxes),
+            labels=tuple(replace(each, position=each.position + by) for each in self.labels),
+        )
 
 
 def show_answer(

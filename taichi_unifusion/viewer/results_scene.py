@@ -1,5 +1,5 @@
 """Results folder, or mesh file -> Scene: the mesh with every layer that its files hold, and the
-cameras. No kernel runs.
+cameras.
 """
 
 from __future__ import annotations
@@ -45,8 +45,7 @@ class SceneOptions:
 
     compare: Path | None = None  # a mesh in the same world, to which distances are shown
     cameras: int = 60  # at most so many, evenly over the trajectory
-    images: bool = False  # load what those cameras saw, where the recording is still there
-    image_width: int = 320  # [pixels]
+    image_width: int = 320  # [pixels] of what those cameras saw, at most
 
 
 def open_scene(path: str | Path, options: SceneOptions | None = None) -> Scene:
@@ -63,19 +62,26 @@ def open_scene(path: str | Path, options: SceneOptions | None = None) -> Scene:
         )
     source = path if folder is None else folder.mesh
     mesh = check_mesh(read_any_mesh(source), str(source))
-    T_up_world = up_of(folder, mesh)
-    looks = {} if folder is None else recorded_looks(folder)
-    bare = Scene(path.name or str(path), (), T_up_world=T_up_world)
-    layers = list(_own_layers(mesh, looks))
-    layers += shape_layers(mesh, bare)
+    bare = Scene(path.name or str(path), (), T_up_world=up_of(folder, mesh))
+    layers = layers_of(mesh, folder, bare, options.compare)
+    cameras = () if folder is None else _cameras(folder, options)
+    return replace(bare, meshes=(SceneMesh(bare.name, mesh, layers),), cameras=cameras)
+
+
+def layers_of(
+    mesh: Mesh, folder: RunFolder | None, scene: Scene, compare: Path | None = None
+) -> tuple[Layer, ...]:
+    """Every layer that a mesh carries, that its shape gives in the upright frame of `scene`, that the
+    files of a results folder hold, and its distances to the mesh `compare`.
+    """
+    layers = [*_own_layers(mesh, {} if folder is None else recorded_looks(folder))]
+    layers += _shape_layers(mesh, scene)
     if folder is not None:
         layers += _map_layers(mesh, folder)
         layers += _answer_layers(mesh, folder)
-    if options.compare is not None:
-        layers.append(distance_layer(mesh, options.compare))
-    shown = SceneMesh(bare.name, mesh, tuple(layers))
-    cameras = () if folder is None else _cameras(folder, options)
-    return replace(bare, meshes=(shown,), cameras=cameras)
+    if compare is not None:
+        layers.append(distance_layer(mesh, compare))
+    return tuple(layers)
 
 
 def up_of(folder: RunFolder | None, mesh: Mesh) -> NDArray[np.float64]:
@@ -100,7 +106,7 @@ def _own_layers(mesh: Mesh, looks: Mapping[str, Look]) -> Iterator[Layer]:
             yield Layer.of_values(name, values, looks.get(name, Look(range=None)))
 
 
-def shape_layers(mesh: Mesh, scene: Scene) -> list[Layer]:
+def _shape_layers(mesh: Mesh, scene: Scene) -> list[Layer]:
     """Normals and heights, seen in the upright frame of the scene."""
     normals = SceneMesh("", mesh, (_blank(mesh),)).normals @ scene.T_up_world[:3, :3].T
     look = Look(range=(-1.0, 1.0), label="normal in x, y and up")
@@ -229,15 +235,31 @@ def _cameras(folder: RunFolder, options: SceneOptions) -> tuple[SceneCamera, ...
         logger.warning("%s", error)
         return ()
     run = find_recorded_run(folder)
-    numbers = range(len(poses)) if run is None or len(run.used) != len(poses) else run.used
+    if run is not None and len(run.used) != len(poses):  # of another run
+        run = None
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), options.cameras)).astype(int))
     camera = SOME_CAMERA if run is None else _camera_of(run)
-    cameras = []
-    for place in chosen:
-        pose, number = poses.T_world_camera[place], int(numbers[place])
-        image = camera_image(run, number, options.image_width) if run and options.images else None
-        cameras.append(SceneCamera(f"frame {number}", camera, pose, image))
-    return tuple(cameras)
+    numbers = range(len(poses)) if run is None else run.used
+    return tuple(
+        SceneCamera(
+            f"frame {numbers[place]}",
+            camera,
+            poses.T_world_camera[place],
+            frame=None if run is None else run.used[place],
+        )
+        for place in chosen
+    )
+
+
+def with_images(scene: Scene, run: Run, width: int) -> Scene:
+    """The scene with what its cameras saw, at most `width` pixels wide, as far as the recording of
+    the run is still there.
+    """
+    cameras = tuple(
+        camera if camera.frame is None else replace(camera, image=_image(run, camera.frame, width))
+        for camera in scene.cameras
+    )
+    return replace(scene, cameras=cameras)
 
 
 def find_recorded_run(folder: RunFolder) -> Run | None:
@@ -256,7 +278,7 @@ def _camera_of(run: Run) -> PinholeCamera:
         return SOME_CAMERA
 
 
-def camera_image(run: Run, index: int, width: int) -> NDArray[np.uint8] | None:
+def _image(run: Run, index: int, width: int) -> NDArray[np.uint8] | None:
     """The colour image (h, w, 3) RGB of a frame, at most `width` wide; None where there is none."""
     try:
         color = run.recording[index].color

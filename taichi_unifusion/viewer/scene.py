@@ -84,8 +84,8 @@ class Layer:
         names: Sequence[str],
         colors: NDArray[np.uint8],
     ) -> Layer:
-        """Classes (V,), rows of `names` and `colors` (n, 3), -1 for none; the legend holds those
-        that occur, the commonest first.
+        """Classes (V,), rows of `names` and `colors` (n, 3), -1 for none. The legend holds those
+        that occur, the commonest first; values are their places in it.
         """
         known = (labels >= 0) & (labels < len(names))
         shown = np.tile(np.array(UNKNOWN, np.uint8), (len(labels), 1))
@@ -93,8 +93,10 @@ class Layer:
         counts = np.bincount(labels[known], minlength=len(names))
         present = [i for i in np.argsort(-counts, kind="stable") if counts[i]]
         legend = Legend(name, colors[present], names=tuple(str(names[i]) for i in present))
-        values = np.where(known, labels, np.nan).astype(np.float32)
-        return cls(name, shown, values[:, None], legend)
+        rank = np.zeros(max(len(names), 1))
+        rank[present] = np.arange(len(present))
+        values = np.where(known, rank[np.where(known, labels, 0)], np.nan)
+        return cls(name, shown, values.astype(np.float32)[:, None], legend)
 
     def take(self, rows: NDArray) -> Layer:
         """The layer of the vertices at `rows`, indices or a mask."""
@@ -108,6 +110,8 @@ class Layer:
         values = np.asarray(values, np.float64)
         if not np.isfinite(values).all():
             return "unknown"
+        if self.legend is not None and self.legend.names:
+            return self.legend.names[int(values[0])]
         numbers = ", ".join(f"{value:.3g}" for value in values)
         return numbers if len(values) == 1 else f"({numbers})"
 
@@ -183,6 +187,7 @@ class SceneCamera:
     camera: PinholeCamera
     T_world_camera: NDArray[np.float64]  # (4, 4), of the scene
     image: NDArray[np.uint8] | None = None  # (h, w, 3) RGB, of any size
+    frame: int | None = None  # place in its recording
 
     def moved(self, by: NDArray) -> SceneCamera:
         """The same camera elsewhere in the scene, (3,) [m]."""

@@ -105,11 +105,11 @@ def files_in(folder: Path) -> list[str]:
             0,
             ["--surface.voxel-size", "--preprocess.depth-max", "--mesh.resolution"],
         ),
-        ([], 2, ["reconstruct, transfer, understand, query, segment, mesh, info, config"]),
+        ([], 2, ["reconstruct, transfer, understand, query, segment, view, mesh, info, config"]),
         (
             ["reconstrukt"],
             2,
-            ["reconstruct, transfer, understand, query, segment, mesh, info, config"],
+            ["reconstruct, transfer, understand, query, segment, view, mesh, info, config"],
         ),
         (
             ["reconstruct", "7scene", "x", "--out", "o"],

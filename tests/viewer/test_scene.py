@@ -22,6 +22,7 @@ from taichi_unifusion.maps import SurfaceMap
 from taichi_unifusion.rendering.look import Look
 from taichi_unifusion.viewer.results_scene import SceneOptions, open_scene
 from taichi_unifusion.viewer.scene import Layer, Scene, SceneMesh, beside, overlaid
+from taichi_unifusion.viewer.source import ResultsSource
 
 EIGHT_BITS = 0.5 / 255 + 1e-6
 FLOOR = 0.01  # [m] off, of a floor that a Kinect saw
@@ -79,7 +80,8 @@ def test_the_cameras_are_those_of_the_trajectory_with_what_they_saw(results):
     few = open_scene(results.path, SceneOptions(cameras=2)).cameras
     assert [camera.name for camera in few] == ["frame 0", "frame 2"]
     assert few[0].image is None and few[0].camera.size == (160, 120)
-    seen = open_scene(results.path, SceneOptions(images=True, image_width=40)).cameras
+    source = ResultsSource(results.path, SceneOptions(image_width=40))
+    seen = source.with_images(source.open()).cameras
     assert len(seen) == 3 and seen[1].image.shape == (30, 40, 3)
     assert seen[1].image.std() > 1
 
@@ -89,7 +91,8 @@ def test_cameras_stay_where_the_recording_is_gone(results, tmp_path):
     record = json.loads((moved / "metrics.json").read_text())
     record["recording"]["path"] = str(tmp_path / "gone")
     (moved / "metrics.json").write_text(json.dumps(record))
-    cameras = open_scene(moved, SceneOptions(images=True)).cameras
+    source = ResultsSource(moved)
+    cameras = source.with_images(source.open()).cameras
     assert len(cameras) == 3 and all(camera.image is None for camera in cameras)
 
 
@@ -151,7 +154,7 @@ def test_a_legend_names_the_classes_that_occur_the_commonest_first():
     layer = Layer.of_labels("class", np.array([2, 2, 0, -1]), ("a", "b", "c"), colors)
     assert layer.legend.names == ("c", "a")
     assert layer.colors[:3].tolist() == [[3] * 3, [3] * 3, [1] * 3]
-    assert np.isnan(layer.values[3, 0])
+    assert [layer.describe(value) for value in layer.values] == ["c", "c", "a", "unknown"]
 
 
 def test_heights_and_up_follow_the_upright_frame():

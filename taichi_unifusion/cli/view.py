@@ -1,0 +1,127 @@
+"""`unifusion view`: results -> a page in the browser, to look at, touch, ask and share."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from ..errors import InputError
+from .options import OPTIONAL, EncoderOptions
+from .terminal import DONE
+
+logger = logging.getLogger(__name__)
+
+if TYPE_CHECKING:
+    from ..viewer.scene import Scene
+    from ..viewer.source import ResultsSource
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """Where a page is shown."""
+
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address to listen on: by default only this machine can open the page; 0.0.0.0 lets everybody
+    who reaches this machine.
+    """
+    port: Annotated[int, arg(metavar="N")] = 8080
+    """Port of the page, or the next one that is free."""
+    no_open: FlagCreatePairsOff[bool] = False
+    """Do not open a browser."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Show results on a page in the browser: every layer, questions, points, distances, parts,
+    cameras.
+
+    Example: unifusion view results/kitchen
+
+    Side by side: unifusion view results/kitchen results/kitchen_fine
+
+    On a machine behind ssh: ssh -L 8080:127.0.0.1:8080 MACHINE, then open http://127.0.0.1:8080
+    here.
+    """
+
+    dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...")]
+    """Results folders of `unifusion`, or mesh files."""
+    overlay: FlagCreatePairsOff[bool] = False
+    """Lay several results over one another instead of side by side."""
+    compare: Annotated[Path | None, arg(metavar="MESH", help_behavior_hint=OPTIONAL)] = None
+    """A mesh in the same world: its distance to each result becomes a layer."""
+    cameras: Annotated[int, arg(metavar="N")] = 60
+    """At most so many cameras are drawn, evenly over the trajectory."""
+    page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
+    encoder: Annotated[EncoderOptions, arg(name="")] = field(default_factory=EncoderOptions)
+
+
+def view(options: View) -> int:
+    """Results -> a page, until Ctrl-C."""
+    if not options.dirs:
+        raise InputError("view: say what to show, for example: unifusion view results/demo")
+    from .. import runtime
+    from ..viewer.web import WebViewer
+
+    sources = [_source_of(path, options) for path in options.dirs]
+    scene = _scene_of(sources, options.overlay)
+    runtime.init(options.encoder.device)
+    viewer = WebViewer(options.page.host, options.page.port, scene.name)
+    try:
+        from ..viewer.web_panels import ResultsPage
+
+        ResultsPage(viewer, scene, sources)
+        print(f"{viewer.address}    Ctrl-C ends it", flush=True)
+        viewer.announce(open_browser=not options.page.no_open)
+        viewer.serve()
+    finally:
+        viewer.close()
+    return DONE
+
+
+def _source_of(path: Path, options: View) -> ResultsSource:
+    """A results folder, with the text encoder that is asked for or belongs to its features."""
+    from ..viewer.results_scene import SceneOptions
+    from ..viewer.source import ResultsSource
+    from .texts import make_encoder
+
+    scene = SceneOptions(options.compare, options.cameras)
+    if not _can_encode(path, options.encoder.text):
+        return ResultsSource(path, scene)
+    return ResultsSource(
+        path, scene, lambda source, directory: make_encoder(options.encoder, source, directory)
+    )
+
+
+def _can_encode(path: Path, text: str | None) -> bool:
+    """Whether questions can be put to a results folder: it holds features, and there is an encoder
+    for the words.
+    """
+    from ..files.maps import read_manifest
+    from ..results.run_folder import RunFolder
+
+    features = RunFolder(path).features
+    if not features.exists():
+        return False
+    source = str(read_manifest(features)["settings"].get("source", ""))
+    if text is None and not source.startswith("clip:"):
+        logger.info(
+            "%s: holds features of %s; to ask, give the text encoder that belongs to them, with --text",
+            path,
+            source or "an unknown network",
+        )
+        return False
+    return True
+
+
+def _scene_of(sources: list[ResultsSource], overlay: bool) -> Scene:
+    """One scene of all of them; equal names are told apart by their paths."""
+    from ..viewer.scene import beside, overlaid
+
+    scenes = [source.open() for source in sources]
+    if len(scenes) == 1:
+        return scenes[0]
+    return (overlaid if overlay else beside)(scenes)

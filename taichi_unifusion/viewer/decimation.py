@@ -1,0 +1,55 @@
+"""Fewer triangles where a page could not hold them all, with a sentence that says what was lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.triangles import SurfaceDistance
+from ..rendering.simplification import simplify
+from ..types import Mesh
+from .scene import Scene, SceneMesh
+
+MEASURED = 3000  # vertices of the whole mesh whose distance to the reduced one is measured
+
+
+def decimate_scene(scene: Scene, triangles: int) -> Scene:
+    """The scene with at most about so many triangles, shared by its meshes as they share them now."""
+    if scene.triangles <= triangles:
+        return scene
+    share = triangles / scene.triangles
+    meshes = [decimate(mesh, int(share * len(mesh.mesh.faces))) for mesh in scene.meshes]
+    return replace(scene, meshes=tuple(meshes))
+
+
+def decimate(shown: SceneMesh, triangles: int) -> SceneMesh:
+    """A mesh of about so many triangles; each vertex takes colours and values of the nearest one of
+    the whole mesh. Its note says what was done, and how far off it is. Errors as `simplify`.
+    """
+    whole = shown.mesh
+    if len(whole.faces) <= triangles:
+        return shown
+    from scipy.spatial import KDTree
+
+    mesh = simplify(whole, max(triangles, 4))
+    rows = np.asarray(KDTree(whole.vertices).query(mesh.vertices)[1])
+    mean, most = _off(whole.vertices, mesh)
+    note = (
+        f"{len(mesh.faces):,} of {len(whole.faces):,} triangles are shown: {1e3 * mean:.1f} mm off the whole mesh in "
+        f"the mean, 99 % within {1e3 * most:.1f} mm"
+    )
+    layers = tuple(layer.take(rows) for layer in shown.layers)
+    return replace(shown, mesh=mesh, layers=layers, note=_joined(shown.note, note))
+
+
+def _off(points: NDArray, mesh: Mesh) -> tuple[float, float]:
+    """Mean and 99th percentile [m] of the distance of some points to a mesh."""
+    chosen = np.linspace(0, len(points) - 1, min(len(points), MEASURED)).astype(int)
+    distances = SurfaceDistance(mesh.vertices, mesh.faces)(points[chosen])
+    return float(distances.mean()), float(np.percentile(distances, 99))
+
+
+def _joined(*notes: str) -> str:
+    return "; ".join(note for note in notes if note)

@@ -1,0 +1,172 @@
+"""A results folder that can be looked at, asked, and extracted again: what viewers get from its maps,
+which are loaded when they are first needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import runtime
+from ..config import MeshSettings, load_config
+from ..errors import InputError
+from ..files.maps import read_manifest
+from ..results.run_folder import RunFolder
+from ..types import Mesh
+from .answers import ShownAnswer, show_answer
+from .results_scene import SceneOptions, find_recorded_run, layers_of, open_scene, with_images
+from .scene import Scene, SceneMesh
+
+if TYPE_CHECKING:
+    from ..maps import FeatureMap, PropertyMap, SurfaceMap
+    from ..networks.encoders import TextEncoder
+
+WORDS = 5  # that are nearest to the features at a point
+# gives the text encoder that belongs to features of a source, which is named after their network
+MakeEncoder = Callable[[str, Path], "TextEncoder"]
+
+
+@dataclass(frozen=True)
+class ResultsSource:
+    """A results folder, or a mesh file, as viewers use it."""
+
+    path: Path
+    options: SceneOptions = field(default_factory=SceneOptions)
+    make_encoder: MakeEncoder | None = None
+
+    @property
+    def folder(self) -> RunFolder | None:
+        """The results folder; None for a mesh file."""
+        return RunFolder(self.path) if self.path.is_dir() else None
+
+    def open(self) -> Scene:
+        """Everything there is to see; raises as `open_scene`."""
+        return open_scene(self.path, self.options)
+
+    def with_images(self, scene: Scene) -> Scene:
+        """The scene with what its cameras saw, as far as the recording is still there."""
+        run = None if self.folder is None else find_recorded_run(self.folder)
+        return scene if run is None else with_images(scene, run, self.options.image_width)
+
+    @property
+    def has_maps(self) -> bool:
+        """Whether the mesh can be extracted again."""
+        return self.folder is not None and "surface" in self.folder.maps
+
+    @property
+    def has_features(self) -> bool:
+        """Whether there is a map that questions can be put to, and an encoder for the words."""
+        return (
+            self.make_encoder is not None
+            and self.folder is not None
+            and self.folder.features.exists()
+        )
+
+    @property
+    def page(self) -> Path:
+        """Where a page to share is written."""
+        return self._beside.page
+
+    def next_part(self) -> Path:
+        """Where the next part that is cut out is written: no file is replaced."""
+        number = 1
+        while self._beside.part(number).exists():
+            number += 1
+        return self._beside.part(number)
+
+    @property
+    def _beside(self) -> RunFolder:
+        return self.folder or RunFolder(self.path.parent)
+
+    def extract(self, scene: Scene, shown: SceneMesh, resolution: int) -> SceneMesh:
+        """The mesh again in the place of `shown`, of so many cells a voxel, with all its layers;
+        raises InputError for a resolution that cannot be, FileError or MapCorrupt where a map
+        cannot be read.
+        """
+        from ..pipeline import extract_mesh
+
+        folder = self._folder
+        settings = load_config(folder.config).mesh if folder.config.exists() else MeshSettings()
+        mesh = extract_mesh(self._surface, self._properties, resolution, settings.min_area)
+        layers = layers_of(mesh, folder, scene, self.options.compare)
+        return SceneMesh(shown.name, mesh, layers).moved(shown.offset)
+
+    def ask(self, shown: SceneMesh, text: str) -> ShownAnswer:
+        """Where on a mesh of this folder something is; raises InputError where the encoder has no
+        vector for the text, or there is none.
+        """
+        from ..language.questions import ask
+
+        mesh = shown.colored(shown.layers[0].name)
+        there = Mesh(shown.mesh.vertices - np.float32(shown.offset), mesh.faces, mesh.normals)
+        answer = ask(self._features, there, self._encoder, [text])[0]
+        found = show_answer(mesh, text, answer.relevance, answer.regions)
+        return found.moved(shown.offset)
+
+    def words_at(self, point: NDArray) -> list[tuple[str, float]]:
+        """The words nearest to the features at a point (3,) [m] of the map, with their cosines, best
+        first; none where the map knows nothing.
+        """
+        names, vectors = self._vocabulary
+        similarity, known = self._features.similarity(
+            np.asarray(point, np.float32)[None], vectors, return_valid=True
+        )
+        if not known[0]:
+            return []
+        best = np.argsort(-similarity[0], kind="stable")[:WORDS]
+        return [(names[i], float(similarity[0, i])) for i in best]
+
+    @property
+    def _folder(self) -> RunFolder:
+        if self.folder is None:
+            raise InputError(f"{self.path}: is a mesh; give a results folder")
+        return self.folder
+
+    @cached_property
+    def _surface(self) -> SurfaceMap:
+        from ..maps import SurfaceMap
+
+        runtime.current()
+        return SurfaceMap.load(self._folder.map("surface"))
+
+    @cached_property
+    def _properties(self) -> dict[str, PropertyMap]:
+        from ..maps import PropertyMap
+
+        runtime.current()
+        return {
+            name: PropertyMap.load(path)
+            for name, path in self._folder.maps.items()
+            if read_manifest(path)["kind"] == PropertyMap.kind
+        }
+
+    @cached_property
+    def _features(self) -> FeatureMap:
+        from ..maps import FeatureMap
+
+        runtime.current()
+        return FeatureMap.load(self._folder.features)
+
+    @cached_property
+    def _encoder(self) -> TextEncoder:
+        if self.make_encoder is None:
+            raise InputError(f"{self.path}: there is no text encoder; give one with --text")
+        return self.make_encoder(self._features.settings.source, self.path)
+
+    @cached_property
+    def _vocabulary(self) -> tuple[tuple[str, ...], NDArray[np.float32]]:
+        """Words and their vectors (n, c): those of a file of embeddings, else what rooms are made
+        of.
+        """
+        from ..language.embeddings import TextEmbeddings
+        from ..language.prompts import NEGATIVES, embed
+
+        if isinstance(self._encoder, TextEmbeddings):
+            return self._encoder.names, self._encoder.vectors
+        return NEGATIVES, embed(self._encoder, NEGATIVES)

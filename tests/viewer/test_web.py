@@ -1,0 +1,287 @@
+"""The page in the browser, as far as no browser is needed: the server, and what its controls do."""
+
+from __future__ import annotations
+
+import http.client
+import logging
+import socket
+
+import numpy as np
+import pytest
+from colored_results import NAMES
+
+from taichi_unifusion.errors import InputError
+from taichi_unifusion.files.mesh_reading import read_mesh
+from taichi_unifusion.files.meshes import write_mesh
+from taichi_unifusion.language.embeddings import read_embeddings
+from taichi_unifusion.viewer.scene import Legend, beside
+from taichi_unifusion.viewer.source import ResultsSource
+from taichi_unifusion.viewer.web_text import legend_html, paragraph
+
+pytest.importorskip("viser", reason="the page needs viser: pip install 'taichi-unifusion[viewer]'")
+
+from taichi_unifusion.viewer.web import WebViewer, has_screen
+from taichi_unifusion.viewer.web_nodes import BANDS, KEPT_LAYERS
+from taichi_unifusion.viewer.web_panels import ResultsPage
+
+SCENE_FILE = "mesh.ply"
+
+
+@pytest.fixture
+def viewer():
+    made = WebViewer(port=some_port())
+    yield made
+    made.close()
+
+
+def some_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def source_of(results) -> ResultsSource:
+    return ResultsSource(results.path, make_encoder=lambda *_: read_embeddings(results.embeddings))
+
+
+@pytest.fixture
+def page(viewer, results) -> ResultsPage:
+    source = source_of(results)
+    return ResultsPage(viewer, source.open(), [source])
+
+
+def shown_layers(page: ResultsPage) -> list[str]:
+    return [name for name, nodes in page.stage.nodes[0].layers.items() if nodes.visible]
+
+
+def ray_of(page: ResultsPage, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where camera `number` looks."""
+    T = page.scene.cameras[number].T_world_camera
+    return T[:3, 3], T[:3, 2]
+
+
+# ---- the server ----
+
+
+def test_only_this_machine_is_answered_and_a_port_that_is_taken_gives_the_next(viewer, caplog):
+    assert viewer.address == f"http://127.0.0.1:{viewer.server.get_port()}"
+    assert viewer.server.get_host() == "127.0.0.1"
+    other = WebViewer(port=viewer.server.get_port())
+    try:
+        with caplog.at_level(logging.INFO):
+            other.announce(open_browser=False)
+        assert other.server.get_port() != viewer.server.get_port()
+        assert f"port {viewer.server.get_port()} is taken" in caplog.text
+    finally:
+        other.close()
+
+
+def test_another_host_is_warned_of(caplog):
+    viewer = WebViewer(host="0.0.0.0", port=some_port())
+    try:
+        with caplog.at_level(logging.WARNING):
+            viewer.announce(open_browser=False)
+        assert "whoever reaches this machine" in caplog.text
+    finally:
+        viewer.close()
+
+
+def test_an_address_that_cannot_be_is_said():
+    with pytest.raises(InputError, match=r"203\.0\.113\.1"):
+        WebViewer(host="203.0.113.1", port=some_port())
+
+
+def test_no_public_tunnel_can_be_asked_for(viewer):
+    assert viewer.server.request_share_url() is None
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/../../../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/..\\setup.py"],
+)
+def test_a_path_in_the_address_opens_nothing(viewer, path):
+    connection = http.client.HTTPConnection("127.0.0.1", viewer.server.get_port(), timeout=10)
+    connection.request("GET", path)
+    answer = connection.getresponse()
+    assert answer.status == 404 and b"root:" not in answer.read()
+    connection.close()
+
+
+def test_a_browser_is_opened_only_where_somebody_sees_it(monkeypatch):
+    for name in ("SSH_CONNECTION", "CI", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert has_screen()
+    monkeypatch.setenv("SSH_CONNECTION", "somewhere")
+    assert not has_screen()
+
+
+def test_a_fault_behind_a_button_ends_neither_the_page_nor_others_wishes(viewer, caplog):
+    done = []
+    viewer.request(lambda: [][0])
+    viewer.request(lambda: done.append("next"))
+    assert viewer.poll() == 2 and done == ["next"]
+    assert "IndexError" in caplog.text
+
+
+# ---- layers ----
+
+
+def test_one_layer_shows_at_a_time_and_few_are_kept(page):
+    assert shown_layers(page) == ["color"]
+    for name in page.scene.layer_names:
+        page.layers.show(name)
+        assert shown_layers(page) == [name]
+    assert len(page.stage.nodes[0].layers) == KEPT_LAYERS
+    page.layers.show("saliency")
+    assert "saliency" in page.layers.legend.content
+
+
+def test_a_cut_hides_what_is_higher_from_eyes_and_clicks(page):
+    nodes = page.stage.nodes[0]
+    low, high = page.scene.heights()
+    middle = (low + high) / 2
+    page.stage.cut_above(middle)
+    assert page.stage.bands in (BANDS // 2, BANDS // 2 + 1)
+    heights = page.scene.heights_of(nodes.shown.mesh.vertices)[nodes.shown.mesh.faces]
+    assert heights[nodes.kept].mean(axis=1).max() <= middle + (high - low) / BANDS
+    bands = nodes.layers["color"].bands
+    assert all(node.visible == (band < page.stage.bands) for band, node in bands.items())
+    page.layers.show("height")  # a layer made later is cut too
+    bands = nodes.layers["height"].bands
+    assert all(node.visible == (band < page.stage.bands) for band, node in bands.items())
+    page.stage.cut_above(high + 1)
+    assert nodes.kept.all() and all(node.visible for node in bands.values())
+
+
+def test_the_mesh_is_extracted_again_finer_or_coarser(page):
+    before = len(page.scene.meshes[0].mesh.faces)
+    page.layers.resolution.value = 2
+    page.layers._extract(None)
+    after = page.scene.meshes[0]
+    assert 0.1 * before < len(after.mesh.faces) < 0.5 * before
+    assert {"color", "saliency", "weight", "height"} <= set(page.scene.layer_names)
+    assert (
+        shown_layers(page) == ["color"]
+        and f"{len(after.mesh.faces):,}" in page.layers.notes.content
+    )
+
+
+def test_cameras_come_with_what_they_saw_and_go(page):
+    page.layers.cameras.value = True
+    page.layers._show_cameras()
+    assert len(page.stage.cameras) == 3
+    assert all(camera.image is not None for camera in page.scene.cameras)
+    page.layers.cameras.value = False
+    page.layers._show_cameras()
+    assert page.stage.cameras == []
+
+
+# ---- questions ----
+
+
+def test_a_question_is_answered_by_heat_boxes_labels_and_a_list(page):
+    page.ask.text.value = "red"
+    page.ask.ask()
+    assert shown_layers(page) == ["query: red"] and page.layers.layer.value == "query: red"
+    assert "place" in page.ask.said.content and page.ask.folder.visible
+    assert len(page.ask.rows) >= 1 and "score" in page.ask.rows[0].label
+    assert len(page.stage.marked["answer"]) == 1 + len(page.ask.rows)  # lines, and a label each
+    red = page.scene.meshes[0].layer("query: red").values[:, 0]
+    color = page.scene.meshes[0].layer("color").colors.astype(float)
+    assert color[red > 0.5][:, 0].mean() > color[red > 0.5][:, 1:].mean()
+    page.ask.text.value = ""
+    page.ask.ask()
+    assert page.stage.marked["answer"] == [] and page.ask.rows == []
+
+
+@pytest.mark.parametrize("text", ["/etc/passwd", "<b>purple</b>"])
+def test_a_text_without_a_vector_is_said_and_opens_nothing(page, text):
+    page.ask.text.value = text
+    page.ask.ask()
+    assert "has no vector" in page.ask.said.content
+    assert "<b>" not in page.ask.said.content and shown_layers(page) == ["color"]
+
+
+def test_what_is_not_here_is_said(viewer, results, tmp_path):
+    vectors = np.vstack([np.eye(3), -np.ones(3)])
+    np.savez(tmp_path / "names.npz", names=(*NAMES, "nothing"), vectors=vectors)
+    embeddings = read_embeddings(tmp_path / "names.npz")
+    source = ResultsSource(results.path, make_encoder=lambda *_: embeddings)
+    page = ResultsPage(viewer, source.open(), [source])
+    page.ask.text.value = "nothing"
+    page.ask.ask()
+    assert "nothing: not here" in page.ask.said.content and page.ask.rows == []
+
+
+def test_results_without_features_have_no_text_box(viewer, results):
+    page = ResultsPage(viewer, ResultsSource(results.path).open(), [ResultsSource(results.path)])
+    assert not hasattr(page, "ask")
+
+
+# ---- points and parts ----
+
+
+def test_a_click_says_what_is_there_and_two_clicks_how_far_apart(page):
+    page.point.click(*ray_of(page, 0))
+    said = page.point.said.content
+    for word in ("position", "height", "normal", "color", "saliency", "weight", "words", *NAMES):
+        assert word in said
+    first = page.point.last.point
+    page.point.click(*ray_of(page, 2))
+    distance = np.linalg.norm(page.point.last.point - first)
+    assert f"{distance:.3f} m" in page.point.said.content
+    page.point.clear()
+    assert page.point.last is None and page.stage.marked["measured"] == []
+
+
+def test_a_part_is_written_beside_the_results_and_replaces_nothing(viewer, results, tmp_path):
+    whole = read_mesh(results.path / SCENE_FILE)
+    write_mesh(tmp_path / "room.ply", whole)
+    source = ResultsSource(tmp_path / "room.ply")
+    page = ResultsPage(viewer, source.open(), [source])
+    middle = whole.vertices.mean(axis=0)
+    page.part.low.value, page.part.high.value = tuple(middle - 5), tuple(middle + (5, 5, 0))
+    page.part.measure()
+    assert "m² of surface" in page.part.said.content
+    page.part.write()
+    page.part.write()
+    one, two = (read_mesh(tmp_path / f"part-{number}.ply") for number in (1, 2))
+    assert np.array_equal(one.vertices, two.vertices)
+    assert 0 < len(one.faces) < len(whole.faces) and one.vertices[:, 2].max() <= middle[2]
+    assert str(tmp_path / "part-2.ply") in page.part.said.content
+
+
+def test_a_page_to_share_is_written_beside_the_results(viewer, results, tmp_path):
+    write_mesh(tmp_path / "room.ply", read_mesh(results.path / SCENE_FILE))
+    source = ResultsSource(tmp_path / "room.ply")
+    page = ResultsPage(viewer, source.open(), [source])
+    page.keep.write_page(None)
+    assert (tmp_path / "page.html").stat().st_size > 10_000
+    assert str(tmp_path / "page.html") in page.keep.said.content
+
+
+# ---- several results ----
+
+
+def test_results_side_by_side_share_layers_and_can_be_hidden(viewer, results):
+    sources = [source_of(results), ResultsSource(results.path)]
+    scene = beside([source.open() for source in sources])
+    page = ResultsPage(viewer, scene, sources)
+    page.layers.show("saliency")
+    assert [nodes.current for nodes in page.stage.nodes] == ["saliency"] * 2
+    origin, direction = ray_of(page, 0)
+    by = page.scene.meshes[1].offset
+    assert page.stage.pick(origin, direction)[0] == 0
+    assert page.stage.pick(origin + by, direction)[0] == 1
+    page.stage.set_visible(1, False)
+    assert page.stage.pick(origin + by, direction) is None
+    page.ask.text.value = "green"
+    page.ask.ask()
+    assert [nodes.current for nodes in page.stage.nodes] == ["query: green", "color"]
+
+
+def test_words_of_files_are_escaped():
+    legend = Legend("<i>label</i>", np.zeros((1, 3), np.uint8), names=("<script>",))
+    assert "<i>" not in legend_html(legend) and "<script>" not in legend_html(legend)
+    assert "<" not in paragraph("<").replace("<div", "").replace("</div", "")
