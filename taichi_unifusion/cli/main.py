@@ -26,6 +26,7 @@ from ..config import Config, load_config
 from ..errors import FileError, UniFusionError
 from .config import ShowConfig, show_config
 from .evaluate import METRICS, Evaluate
+from .export import Export, export
 from .info import Info, info
 from .interrupts import INTERRUPTED
 from .mesh import ExtractMesh, extract_mesh
@@ -55,6 +56,7 @@ COMMANDS: Commands = {
     "segment": (Segment, segment),
     "view": (View, view),
     "mesh": (ExtractMesh, extract_mesh),
+    "export": (Export, export),
     "info": (Info, info),
     "config": (ShowConfig, show_config),
     "evaluate": (Evaluate, METRICS),

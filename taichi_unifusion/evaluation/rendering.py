@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..files.texture import Texture
 from ..rendering.raycaster import RayCaster
 from ..types import Frame, Mesh
 
@@ -67,14 +68,15 @@ def evaluate_rendering(
     frames: Iterable[Frame],
     *,
     color: ColorAt | None = None,
+    texture: Texture | None = None,
     depth_min: float = 0.1,
     depth_max: float = 5.0,
 ) -> RenderingResult:
     """Compare images with the mesh rendered at their poses.
 
     Depth is that of the rays through the pixel centres, from either side of the surface. Colour is
-    `color` at the points hit (the query of a colour LIM, as published), else the mesh's vertex
-    colours, else none. Compared are pixels whose reading lies in depth_min..depth_max [m] and whose
+    `color` at the points hit (the query of a colour LIM, as published), else the mesh's `texture`,
+    else its vertex colours, else none. Compared are pixels whose reading lies in depth_min..depth_max [m] and whose
     ray hits; what is not hit lowers `coverage` and `depth_within` only.
 
     Raises InputError for a mesh that is empty or not finite, where there is no frame, or no frame
@@ -86,7 +88,8 @@ def evaluate_rendering(
         )
     caster = RayCaster(mesh, "reconstruction")
     scores = tuple(
-        _score(render_frame(caster, frame, color), frame, depth_min, depth_max) for frame in frames
+        _score(render_frame(caster, frame, color, texture), frame, depth_min, depth_max)
+        for frame in frames
     )
     if not scores:
         raise InputError("rendering: there are no frames to compare with")
@@ -99,18 +102,24 @@ def evaluate_rendering(
     return RenderingResult(**means, frames=scores)
 
 
-def render_frame(caster: RayCaster, frame: Frame, color: ColorAt | None = None) -> RenderedFrame:
+def render_frame(
+    caster: RayCaster,
+    frame: Frame,
+    color: ColorAt | None = None,
+    texture: Texture | None = None,
+) -> RenderedFrame:
     """What the camera of `frame` would see of the caster's mesh; colour as in `evaluate_rendering`."""
     hits = caster.cast(frame.camera, frame.require_pose())
-    if color is None and "color" not in caster.mesh.attributes:
+    if color is None and texture is None and "color" not in caster.mesh.attributes:
         return RenderedFrame(hits.depth, None)
     image = np.zeros((*hits.depth.shape, 3), np.float32)
     if hits.hit.any():
-        values = (
-            color(hits.points(hits.hit))
-            if color
-            else caster.interpolate(hits, hits.hit, caster.mesh.attributes["color"])
-        )
+        if color:
+            values = color(hits.points(hits.hit))
+        elif texture:
+            values = texture.at(caster.interpolate(hits, hits.hit, texture.coordinates))
+        else:
+            values = caster.interpolate(hits, hits.hit, caster.mesh.attributes["color"])
         if values.shape[1:] != (3,):
             raise InputError(f"rendering: colours must be (N, 3) RGB in [0, 1], got {values.shape}")
         image[hits.hit] = np.clip(values, 0, 1)

@@ -33,6 +33,20 @@ class Texture:
                 f"texture: image must be (H, W, 3) uint8, got {self.image.shape} {self.image.dtype}"
             )
 
+    def at(self, coordinates: NDArray) -> NDArray[np.float32]:
+        """Colours (N, 3) in [0, 1] at texture coordinates (N, 2), bilinear between texels' centres and
+        constant beyond the outer ones.
+        """
+        height, width = self.image.shape[:2]
+        x, y = (np.asarray(coordinates, np.float64) * (width, height) - 0.5).T
+        x, y = x.clip(0, width - 1), y.clip(0, height - 1)
+        column, row = x.astype(int), y.astype(int)
+        right, below = np.minimum(column + 1, width - 1), np.minimum(row + 1, height - 1)
+        a, b = (x - column)[:, None], (y - row)[:, None]
+        upper = (1 - a) * self.image[row, column] + a * self.image[row, right]
+        lower = (1 - a) * self.image[below, column] + a * self.image[below, right]
+        return (((1 - b) * upper + b * lower) / 255).astype(np.float32)
+
     def encoded(self, kind: ImageKind) -> bytes:
         """The image as the bytes of a PNG or JPEG file, colour at full resolution in both."""
         import cv2  # a tenth of a second, which meshes without a texture do not need

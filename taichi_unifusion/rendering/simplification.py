@@ -21,8 +21,9 @@ from ..geometry.triangles import SurfaceDistance, areas, sample_surface, vertex_
 from ..types import Mesh
 from .mesh_checks import check_mesh
 
-# from careful to hasty: the first that gets there is taken
-HASTE = (3.0, 5.0, 7.0)
+# how fast the error that is allowed grows: the first that gets there is taken; the careful one gets to
+# about a tenth of the triangles
+HASTE, CAREFUL_SHARE = (3.0, 5.0, 7.0), 0.12
 REACHED = 1.05  # times the triangles asked for
 SAMPLES = 20_000  # points that each surface is measured at
 MIN_AREA = 1e-12  # [m^2] of a triangle
@@ -67,7 +68,7 @@ def simplify(mesh: Mesh, triangles: int) -> Mesh:
     faces = np.concatenate([mesh.faces, fins])
     run: Any = library.simplify  # its types know float64 alone
     collapses = None
-    for haste in HASTE:
+    for haste in HASTE[int(triangles < CAREFUL_SHARE * len(mesh.faces)) :]:
         _, found, collapses = run(
             points, faces, target_count=triangles, agg=haste, return_collapses=True
         )

@@ -105,11 +105,15 @@ def files_in(folder: Path) -> list[str]:
             0,
             ["--surface.voxel-size", "--preprocess.depth-max", "--mesh.resolution"],
         ),
-        ([], 2, ["reconstruct, transfer, understand, query, segment, view, mesh, info, config"]),
+        (
+            [],
+            2,
+            ["reconstruct, transfer, understand, query, segment, view, mesh, export, info, config"],
+        ),
         (
             ["reconstrukt"],
             2,
-            ["reconstruct, transfer, understand, query, segment, view, mesh, info, config"],
+            ["reconstruct, transfer, understand, query, segment, view, mesh, export, info, config"],
         ),
         (
             ["reconstruct", "7scene", "x", "--out", "o"],

@@ -15,7 +15,9 @@ from taichi_unifusion import Frame, PinholeCamera, open_dataset
 from taichi_unifusion.errors import InputError, PoseError
 from taichi_unifusion.evaluation import evaluate_rendering
 from taichi_unifusion.evaluation.rendering import psnr, render_frame, ssim
+from taichi_unifusion.files.texture import Texture
 from taichi_unifusion.rendering.raycaster import RayCaster
+from taichi_unifusion.types import Mesh
 
 ROUNDING = 1e-4  # [cm] depth is float32
 SAME_DEPTH = 1e-4  # relative to Open3D's float32 rays
@@ -326,3 +328,20 @@ def test_bad_input_is_told_in_one_sentence(mesh, frames, options, error, told):
 def test_results_are_values():
     with pytest.raises(dataclasses.FrozenInstanceError):
         evaluate_rendering(WALL, [frame_of(2.0)]).coverage = 1
+
+
+# --- Textures -------------------------------------------------------------------------------------------------------
+
+
+def test_a_texture_is_what_the_camera_sees():
+    # a wall that fills the image, whose texture is the frame itself
+    color = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), np.uint8)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [CAMERA.width, CAMERA.height] - 0.5
+    rays = CAMERA.rays(*corners.T)
+    mesh = Mesh((2 * rays).astype(np.float32), np.array([[0, 2, 1], [0, 3, 2]], np.int32))
+    places = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    frame = frame_of(2.0, color)
+    result = evaluate_rendering(mesh, [frame], texture=Texture(places, color))
+    assert result.coverage == 1 and result.psnr_db > 45
+    turned = Texture(places[[1, 2, 3, 0]], color)
+    assert evaluate_rendering(mesh, [frame], texture=turned).psnr_db < 15

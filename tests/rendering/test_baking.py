@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from taichi_unifusion.errors import InputError
+from taichi_unifusion.files.texture import Texture
 from taichi_unifusion.geometry.triangles import sample_surface
 from taichi_unifusion.rendering.atlas import unwrap
 from taichi_unifusion.rendering.baking import bake
@@ -148,6 +149,16 @@ def test_a_surface_that_cannot_fit_is_said():
     )
     with pytest.raises(InputError, match="charts do not fit into 16 x 16 texels"):
         unwrap(crumbs, 0.001, 16)
+
+
+def test_a_texture_is_looked_up_as_graphics_hardware_does():
+    image = np.random.default_rng(0).integers(0, 256, (7, 5, 3), np.uint8)
+    coordinates = np.random.default_rng(1).random((500, 2)).astype(np.float32)
+    texture = Texture(coordinates, image)
+    np.testing.assert_allclose(texture.at(coordinates), look_up(image, coordinates), atol=1e-6)
+    corners = np.array([(0, 0), (1, 1), (-3, 0.5), (2.5 / 5, 3.5 / 7)])
+    ends = np.stack([image[0, 0], image[6, 4], image[3, 0], image[3, 2]]) / 255
+    np.testing.assert_allclose(texture.at(corners), ends, atol=1e-6)
 
 
 @pytest.mark.parametrize(
