@@ -15,7 +15,7 @@ from ..errors import InputError, MissingDependency
 from ..results.run_folder import RunFolder
 from ..results.tables import format_bytes
 from .options import OPTIONAL, Device
-from .terminal import report
+from .terminal import DONE
 
 if TYPE_CHECKING:
     from ..files.texture import ImageKind, Texture
@@ -43,9 +43,9 @@ class Export:
 
     Example: unifusion export results/flat flat.glb
 
-    OUT chooses: .glb, .obj, .usdz, .usdc: a textured mesh of a quarter of the triangles; .ply: the
-    mesh with colours at its vertices, or with --points points; .las, .laz: points; a name without a
-    suffix: a folder for game engines.
+    OUT chooses: .glb, .obj, .usdz, .usdc: a textured mesh of a quarter of the triangles; .html: a page
+    with every layer that opens without a network; .ply: the mesh with colours at its vertices, or
+    with --points points; .las, .laz: points; a name without a suffix: a folder for game engines.
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
@@ -81,30 +81,39 @@ class Export:
 def export(options: Export) -> int:
     """Results folder -> what OUT says."""
     kind = options.out.suffix.lower()
-    if kind not in WRITERS:
+    if kind not in (*WRITERS, PAGE):
         raise InputError(
-            f"{options.out}: exports are written as {', '.join(filter(None, WRITERS))}, or a folder, not "
-            f"as '{options.out.suffix}'"
+            f"{options.out}: exports are written as {', '.join(filter(None, WRITERS))}, {PAGE} or a "
+            f"folder, not as '{options.out.suffix}'"
         )
     _check(options, kind)
     from ..files.atomic import check_writable
 
     check_writable(options.out.parent)
+    if kind == PAGE:
+        from ..viewer.page import write_page
+        from ..viewer.results_scene import open_scene
+
+        print(f"{options.out}: {write_page(open_scene(options.dir), options.out)}")
+        return DONE
     from ..results.export_source import read_export_source
 
     source = read_export_source(RunFolder(options.dir), options.property, options.device)
     files = WRITERS[kind](source, options)
     for file in files:
         print(f"{file}: {format_bytes(file.stat().st_size)}")
-    return report([])
+    return DONE
 
 
 def _check(options: Export, kind: str) -> None:
     """Raise for options that do not fit, and for packages that are missing, before any work."""
     with_points = kind in POINTS or options.points is not None
+    if kind == PAGE and (options.property != "color" or options.vertex_colors):
+        raise InputError(f"{options.out}: a page holds every property, and chooses them itself")
     if options.points is not None and (kind not in (".ply", *POINTS) or options.points < 1):
         raise InputError("--points: needs at least one point, and OUT as .ply, .las or .laz")
-    if options.triangles is not None and (with_points or not options.triangles > 0):
+    no_mesh = with_points or kind == PAGE
+    if options.triangles is not None and (no_mesh or not options.triangles > 0):
         raise InputError("--triangles: must be more than 0, and OUT a mesh")
     if options.out.is_dir() != (kind == "") and options.out.exists():
         kinds = ("file", "folder") if kind == "" else ("folder", "file")
@@ -278,4 +287,5 @@ WRITERS: dict[str, Writer] = {
     ".laz": _write_las,
     "": _write_engine_folder,
 }
+PAGE = ".html"
 TEXTURED, POINTS = (".glb", ".obj", ".usdz", ".usdc", ""), (".las", ".laz")
