@@ -28,7 +28,7 @@ from .maps.window import WindowFusion
 from .networks.encoders import ImageEncoder
 from .preprocessing import PreprocessSettings, find_patches, invert_depth, preprocess
 from .properties import SurfaceProperty, make_property
-from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, StepResult
+from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, SkippedFrame, StepResult
 from .types import Frame, Mesh, PinholeCamera
 
 logger = logging.getLogger(__name__)
@@ -43,6 +43,10 @@ class Source(Protocol):
     def add_to(self, frame: Frame) -> Frame: ...
 
     def make_map(self, frame: Frame) -> BaseMap: ...
+
+
+# is told of a frame that was fused, what that did, and the pipeline
+OnStep = Callable[[Frame, StepResult, "Pipeline"], None]
 
 
 class Pipeline:
@@ -184,13 +188,15 @@ class Pipeline:
         strict: bool = False,
         stop: Callable[[], bool] = lambda: False,
         on_frame: Callable[[int, int], None] = lambda done, total: None,
-        on_step: Callable[[StepResult, Pipeline], None] = lambda step, pipeline: None,
+        on_step: OnStep = lambda frame, step, pipeline: None,
+        on_skip: Callable[[SkippedFrame], None] = lambda skipped: None,
     ) -> RunResult:
         """Fuse a sequence in order, skipping frames that cannot be used; `strict` ends the run at
         the first of them.
 
         `stop` is asked before every frame, `on_frame` told after it how many there were, `on_step`
-        after each that was fused what it did: there a viewer can look at the maps. What ends a run
+        after each that was fused what it did, `on_skip` which one was not used and why: there a
+        viewer can look at the maps. What ends a run
         early is in the result, with all that was done until then; raises DatasetError only where
         not one frame could be used.
         """
@@ -205,9 +211,9 @@ class Pipeline:
                 log.check_depth_scale(frame)
                 step = self.step(frame)
                 log.add_step(frame, step, waited)
-                on_step(step, self)
+                on_step(frame, step, self)
             except tuple(SKIP_REASONS) as error:
-                log.add_skipped(i, error)
+                on_skip(log.add_skipped(i, error))
                 failure = error if strict else None
             except UniFusionError as error:
                 failure = error

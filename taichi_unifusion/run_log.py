@@ -139,12 +139,14 @@ class RunLog:
             }
             self.steps[-1] = replace(last, milliseconds=total)
 
-    def add_skipped(self, i: int, error: UniFusionError) -> None:
+    def add_skipped(self, i: int, error: UniFusionError) -> SkippedFrame:
         reason = next(reason for kind, reason in SKIP_REASONS.items() if isinstance(error, kind))
         if reason not in self.reasons:
             self.warn(f"frame skipped, {reason}: {error}")
         self.reasons[reason] += 1
-        self.skipped.append(SkippedFrame(index_in_recording(self.sequence, i), reason, str(error)))
+        skipped = SkippedFrame(index_in_recording(self.sequence, i), reason, str(error))
+        self.skipped.append(skipped)
+        return skipped
 
     def result(self, interrupted: bool, failure: UniFusionError | None) -> RunResult:
         if not self.steps and not interrupted:

@@ -119,6 +119,20 @@ def test_a_run_fuses_all_frames(fused, frames):
     )
 
 
+def test_a_run_tells_of_every_frame_what_became_of_it(pipeline, frames):
+    bad = replace(frames[1], T_world_camera=None)
+    fused, skipped = [], []
+    result = pipeline.run(
+        [frames[0], bad, frames[2]],
+        on_step=lambda frame, step, told: fused.append((frame, step.index, told)),
+        on_skip=skipped.append,
+    )
+    assert [(frame.index, index) for frame, index, _ in fused] == [(0, 0), (2, 2)]
+    assert np.array_equal(fused[1][0].depth, frames[2].depth)
+    assert all(told is pipeline for *_, told in fused)
+    assert tuple(skipped) == result.skipped and skipped[0].reason == "no usable pose"
+
+
 def test_a_run_is_its_steps_in_order(pipeline, frames):
     told = []
     result = pipeline.run(frames, on_frame=lambda done, total: told.append((done, total)))

@@ -24,10 +24,12 @@ from .options import (
     source_of,
 )
 from .terminal import frame_progress, report
+from .viewing import WatchOptions, open_watcher
 
 if TYPE_CHECKING:
     from ..networks.encoders import ImageEncoder
     from ..results import RunFolder
+    from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +51,7 @@ class Reconstruct:
     recording: Annotated[RecordingOptions, arg(name="")]
     poses: Annotated[TrackingOptions, arg(name="")]
     output: Annotated[OutputOptions, arg(name="")]
+    watch: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
     settings: Settings = field(default_factory=Config, kw_only=True)
 
 
@@ -72,8 +75,19 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
             folder.path,
             earlier,
         )
+    frames = len(range(0, len(recording), options.recording.every))
     with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
-        return _fuse_and_write(recording, options, folder, stop, encoder, up)
+        watcher = open_watcher(options.watch, folder.path.name, frames, stop)
+        try:
+            code = _fuse_and_write(recording, options, folder, stop, encoder, up, watcher)
+        except BaseException:
+            watcher.close()
+            raise
+    if code == INTERRUPTED:
+        watcher.close()
+    else:
+        watcher.finish(folder.path)
+    return code
 
 
 def _fuse_and_write(
@@ -83,6 +97,7 @@ def _fuse_and_write(
     stop: Callable[[], bool],
     encoder: ImageEncoder | None,
     up: Up | None,
+    watcher: Watcher,
 ) -> int:
     from ..pipeline import Pipeline
     from ..results.summary import summarize
@@ -96,7 +111,14 @@ def _fuse_and_write(
     source = source_of(options.recording, len(frames))
     pipeline = Pipeline(options.settings, encoder=encoder)
     with frame_progress(len(frames)) as on_frame:
-        run = pipeline.run(frames, strict=options.recording.strict, stop=stop, on_frame=on_frame)
+        run = pipeline.run(
+            frames,
+            strict=options.recording.strict,
+            stop=stop,
+            on_frame=on_frame,
+            on_step=watcher.on_step,
+            on_skip=watcher.on_skip,
+        )
     if not run.steps:
         logger.warning(
             "stopped before the first frame was done; %s",

@@ -12,26 +12,13 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from ..errors import InputError
 from .options import OPTIONAL, EncoderOptions
 from .terminal import DONE
+from .viewing import PageOptions, open_page
 
 logger = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from ..viewer.scene import Scene
     from ..viewer.source import ResultsSource
-
-
-@dataclass(frozen=True)
-class PageOptions:
-    """Where a page is shown."""
-
-    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen on: by default only this machine can open the page; 0.0.0.0 lets everybody
-    who reaches this machine.
-    """
-    port: Annotated[int, arg(metavar="N")] = 8080
-    """Port of the page, or the next one that is free."""
-    no_open: FlagCreatePairsOff[bool] = False
-    """Do not open a browser."""
 
 
 @dataclass(frozen=True)
@@ -64,18 +51,15 @@ def view(options: View) -> int:
     if not options.dirs:
         raise InputError("view: say what to show, for example: unifusion view results/demo")
     from .. import runtime
-    from ..viewer.web import WebViewer
 
     sources = [_source_of(path, options) for path in options.dirs]
     scene = _scene_of(sources, options.overlay)
     runtime.init(options.encoder.device)
-    viewer = WebViewer(options.page.host, options.page.port, scene.name)
+    viewer = open_page(options.page, scene.name)
     try:
         from ..viewer.web_panels import ResultsPage
 
         ResultsPage(viewer, scene, sources)
-        print(f"{viewer.address}    Ctrl-C ends it", flush=True)
-        viewer.announce(open_browser=not options.page.no_open)
         viewer.serve()
     finally:
         viewer.close()

@@ -89,7 +89,7 @@ class WebViewer:
             each.add_notification(title, text, color=color, auto_close_seconds=12.0)
 
     def announce(self, open_browser: bool) -> None:
-        """Say where the page is, and open it where there is a screen."""
+        """Say where the page is, and open it in a browser where somebody would see that."""
         port = self.server.get_port()
         if port != self.asked_port:
             logger.info("port %d is taken, so the page is on port %d", self.asked_port, port)
@@ -99,6 +99,7 @@ class WebViewer:
                 "written into its folder",
                 self.host,
             )
+        logger.info("the page is at %s until Ctrl-C", self.address)
         if open_browser and has_screen():
             webbrowser.open(self.address)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import http.client
 import logging
-import socket
 
 import numpy as np
 import pytest
 from colored_results import NAMES
+from ports import some_port
 
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.files.mesh_reading import read_mesh
@@ -32,12 +32,6 @@ def viewer():
     made = WebViewer(port=some_port())
     yield made
     made.close()
-
-
-def some_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def source_of(results) -> ResultsSource:

@@ -1,0 +1,59 @@
+"""Options of commands that can be watched, and the viewer that they ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+if TYPE_CHECKING:
+    from ..viewer.null import Watcher
+    from ..viewer.web import WebViewer
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """Where a page is shown."""
+
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address to listen on: by default only this machine can open the page; 0.0.0.0 lets everybody
+    who reaches this machine.
+    """
+    port: Annotated[int, arg(metavar="N")] = 8080
+    """Port of the page, or the next one that is free."""
+    no_open: FlagCreatePairsOff[bool] = False
+    """Do not open a browser."""
+
+
+@dataclass(frozen=True)
+class WatchOptions:
+    """Whether and where a run is shown while it goes on."""
+
+    view: FlagCreatePairsOff[bool] = False
+    """Show the map on a page in the browser while it grows; the page stays until Ctrl-C."""
+    page: Annotated[PageOptions, arg(name="view")] = field(default_factory=PageOptions)
+
+
+def open_page(options: PageOptions, title: str) -> WebViewer:
+    """A page that is there, with its address said."""
+    from ..viewer.web import WebViewer
+
+    viewer = WebViewer(options.host, options.port, title)
+    viewer.announce(open_browser=not options.no_open)
+    return viewer
+
+
+def open_watcher(
+    options: WatchOptions, title: str, frames: int, stop: Callable[[], bool]
+) -> Watcher:
+    """What watches a run of so many frames, which ends early when `stop` says so."""
+    if not options.view:
+        from ..viewer.null import NullViewer
+
+        return NullViewer()
+    viewer = open_page(options.page, title)
+    from ..viewer.web_live import WebLive
+
+    return WebLive(viewer, frames, stop)
