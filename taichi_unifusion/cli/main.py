@@ -32,6 +32,7 @@ from .interrupts import INTERRUPTED
 from .mesh import ExtractMesh, extract_mesh
 from .query import Query, query
 from .reconstruct import Reconstruct, reconstruct
+from .render import Render, render
 from .segment import Segment, segment
 from .terminal import DONE, FAILED, log_to_stderr, report
 from .transfer import Transfer, transfer
@@ -55,6 +56,7 @@ COMMANDS: Commands = {
     "query": (Query, query),
     "segment": (Segment, segment),
     "view": (View, view),
+    "render": (Render, render),
     "mesh": (ExtractMesh, extract_mesh),
     "export": (Export, export),
     "info": (Info, info),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,10 +10,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..errors import InputError
 from .options import OPTIONAL, EncoderOptions
+from .results_source import results_source
 from .terminal import DONE
 from .viewing import PageOptions, open_page
-
-logger = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from ..viewer.scene import Scene
@@ -51,8 +49,10 @@ def view(options: View) -> int:
     if not options.dirs:
         raise InputError("view: say what to show, for example: unifusion view results/demo")
     from .. import runtime
+    from ..viewer.results_scene import SceneOptions
 
-    sources = [_source_of(path, options) for path in options.dirs]
+    shown = SceneOptions(options.compare, options.cameras)
+    sources = [results_source(path, shown, options.encoder) for path in options.dirs]
     scene = _scene_of(sources, options.overlay)
     runtime.init(options.encoder.device)
     viewer = open_page(options.page, scene.name)
@@ -64,41 +64,6 @@ def view(options: View) -> int:
     finally:
         viewer.close()
     return DONE
-
-
-def _source_of(path: Path, options: View) -> ResultsSource:
-    """A results folder, with the text encoder that is asked for or belongs to its features."""
-    from ..viewer.results_scene import SceneOptions
-    from ..viewer.source import ResultsSource
-    from .texts import make_encoder
-
-    scene = SceneOptions(options.compare, options.cameras)
-    if not _can_encode(path, options.encoder.text):
-        return ResultsSource(path, scene)
-    return ResultsSource(
-        path, scene, lambda source, directory: make_encoder(options.encoder, source, directory)
-    )
-
-
-def _can_encode(path: Path, text: str | None) -> bool:
-    """Whether questions can be put to a results folder: it holds features, and there is an encoder
-    for the words.
-    """
-    from ..files.maps import read_manifest
-    from ..results.run_folder import RunFolder
-
-    features = RunFolder(path).features
-    if not features.exists():
-        return False
-    source = str(read_manifest(features)["settings"].get("source", ""))
-    if text is None and not source.startswith("clip:"):
-        logger.info(
-            "%s: holds features of %s; to ask, give the text encoder that belongs to them, with --text",
-            path,
-            source or "an unknown network",
-        )
-        return False
-    return True
 
 
 def _scene_of(sources: list[ResultsSource], overlay: bool) -> Scene:

@@ -167,6 +167,16 @@ def write_png(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
         temporary.write_bytes(content.tobytes())
 
 
+def write_depth_png(path: str | os.PathLike[str], depth: NDArray[np.floating]) -> None:
+    """Write depth (H, W) [m] as a PNG of 16-bit millimetres, 0 where there is none or it is farther
+    than 65.534 m; raises FileError where that fails.
+    """
+    millimetres = np.where(depth < 65.5345, 1000 * depth + 0.5, 0).astype(np.uint16)
+    content = cv2.imencode(".png", millimetres)[1]
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content.tobytes())
+
+
 def _read_bytes(path: Path, count: int = -1) -> bytes:
     try:
         with open(path, "rb") as file:

@@ -81,9 +81,18 @@ class Drawable:
             SHADING[color is not None],
         )
 
-    def draw(self, view: Viewpoint) -> NDArray[np.uint8]:
-        """Picture (H, W, 3) RGB of the sides that face the camera."""
-        camera = view.camera.resized(view.camera.width * SAMPLES, view.camera.height * SAMPLES)
+    def draw(
+        self,
+        view: Viewpoint,
+        samples: int = SAMPLES,
+        *,
+        occluded: bool = True,
+        background: tuple[float, float, float] = BACKGROUND,
+    ) -> NDArray[np.uint8]:
+        """Picture (H, W, 3) RGB of the sides that face the camera, the mean of samples^2 a pixel;
+        corners are darker where light is `occluded`.
+        """
+        camera = view.camera.resized(view.camera.width * samples, view.camera.height * samples)
         drawn = self.depth_buffer(replace(view, camera=camera))
         from .kernels.raster import shade_pixels, thin_out
 
@@ -105,8 +114,8 @@ class Drawable:
             thinned,
             (*light, self.shading),
             OCCLUSION_RADIUS,
-            OCCLUSION_TAPS,
-            BACKGROUND,
+            OCCLUSION_TAPS if occluded else 0,
+            background,
             image,
         )
         return image

@@ -193,7 +193,7 @@ def shade_pixels(
     thinned: ti.i32,
     light: ti.math.vec4,  # unit direction to it, camera frame; how much it changes colours, 0..1
     radius: ti.f32,  # of ambient occlusion [m]
-    taps: ti.i32,  # depths looked at for it, a sample
+    taps: ti.i32,  # depths looked at for it, a surface in a pixel; 0: none is wanted
     background: ti.math.vec3,  # RGB in [0, 1]
     # out:
     image: Image,  # (H, W, 3) RGB
@@ -226,7 +226,7 @@ def shade_pixels(
                 n /= n.norm() + 1e-9
                 lit = 0.5 + 0.5 * n.dot(light.xyz)  # half Lambert: nothing falls into black
                 z = depth_of(nearest[v, u])
-                if ti.abs(z - hidden_at) > ONE_SURFACE * z:
+                if taps > 0 and ti.abs(z - hidden_at) > ONE_SURFACE * z:
                     hidden = occlusion(depth, v, u, z, n, intrinsics, radius, taps, thinned)
                     hidden_at = z
                 rgb *= 1.0 - light[3] + light[3] * lit * LIFT

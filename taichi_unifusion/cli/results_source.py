@@ -1,0 +1,48 @@
+"""Results folders as viewers use them, with the text encoder that the command line names."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .options import EncoderOptions
+
+if TYPE_CHECKING:
+    from ..viewer.results_scene import SceneOptions
+    from ..viewer.source import ResultsSource
+
+logger = logging.getLogger(__name__)
+
+
+def results_source(path: Path, scene: SceneOptions, encoder: EncoderOptions) -> ResultsSource:
+    """A results folder, with the text encoder that is asked for or belongs to its features."""
+    from ..viewer.source import ResultsSource
+    from .texts import make_encoder
+
+    if not _can_encode(path, encoder.text):
+        return ResultsSource(path, scene)
+    return ResultsSource(
+        path, scene, lambda source, directory: make_encoder(encoder, source, directory)
+    )
+
+
+def _can_encode(path: Path, text: str | None) -> bool:
+    """Whether questions can be put to a results folder: it holds features, and there is an encoder
+    for the words.
+    """
+    from ..files.maps import read_manifest
+    from ..results.run_folder import RunFolder
+
+    features = RunFolder(path).features
+    if not features.exists():
+        return False
+    source = str(read_manifest(features)["settings"].get("source", ""))
+    if text is None and not source.startswith("clip:"):
+        logger.info(
+            "%s: holds features of %s; to ask, give the text encoder that belongs to them, with --text",
+            path,
+            source or "an unknown network",
+        )
+        return False
+    return True
