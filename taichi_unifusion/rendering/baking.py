@@ -13,13 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import runtime
 from ..errors import InputError
 from ..files.ply import color_to_uint8
 from ..files.texture import Texture
 from ..types import Mesh
 from .atlas import Atlas, unwrap
-from .depth_buffer import EMPTY
 from .mesh_checks import check_mesh
 
 TEXEL_M = 0.005
@@ -63,7 +61,7 @@ def bake(
     points = np.empty((len(shown), 3), np.float32)
     for start in range(0, len(shown), CHUNK):
         part = slice(start, start + CHUNK)
-        points[part] = surface_points(atlas, shown[part], nearest.ravel()[shown[part]])
+        points[part] = atlas.points(shown[part], nearest.ravel()[shown[part]])
         colors[part], known[part] = color(points[part])
     image = _filled(distance.shape, shown, _lend(points, colors, known))
     return TexturedMesh(atlas.mesh, Texture(atlas.coordinates, image), atlas.texel_m)
@@ -73,15 +71,7 @@ def nearest_faces(atlas: Atlas) -> tuple[NDArray[np.int32], NDArray[np.float32]]
     """The face (H, W) that covers each texel's centre or, where none does, the nearest covered one,
     and how far (H, W) that is [texels].
     """
-    runtime.current()  # before Taichi is imported: it says what it starts
-    from .kernels.raster import rasterize
-
-    flat = np.zeros((len(atlas.places), 3), np.float32)
-    flat[:, :2] = atlas.places - 0.5  # the rasteriser's pixels are centred at integers
-    drop_z = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
-    drawn = np.empty((atlas.height, atlas.width), np.int64)
-    rasterize(flat, atlas.mesh.faces, 1, drop_z, 0.5, drawn)
-    face = np.where(drawn == EMPTY, -1, drawn & 0xFFFFFFFF).astype(np.int32)
+    face = atlas.draw_faces()
     _claim_centers(atlas, face)
     covered = face >= 0
     label, distance = _nearest(covered)
@@ -96,25 +86,6 @@ def _claim_centers(atlas: Atlas, face: NDArray[np.int32]) -> None:
     x, y = np.clip(x, 0, atlas.width - 1), np.clip(y, 0, atlas.height - 1)
     free = np.flatnonzero(face[y, x] < 0)
     face[y[free], x[free]] = free
-
-
-def surface_points(
-    atlas: Atlas, texels: NDArray[np.int64], faces: NDArray[np.int32]
-) -> NDArray[np.float32]:
-    """Places (N, 3) world [m] on the planes of faces (N,) that the centres of texels (N,), numbered
-    row by row, lie at.
-    """
-    corners = atlas.mesh.faces[faces]
-    a, b, c = (atlas.places[corners[:, k]] for k in range(3))
-    at = np.column_stack([texels % atlas.width, texels // atlas.width]) + 0.5 - a
-    u, v = b - a, c - a
-    det = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    thin = np.abs(det) < 1e-9
-    det = np.where(thin, 1, det)
-    s = np.where(thin, 1 / 3, (at[:, 0] * v[:, 1] - at[:, 1] * v[:, 0]) / det)[:, None]
-    t = np.where(thin, 1 / 3, (u[:, 0] * at[:, 1] - u[:, 1] * at[:, 0]) / det)[:, None]
-    a, b, c = (atlas.mesh.vertices[corners[:, k]].astype(np.float64) for k in range(3))
-    return (a + s * (b - a) + t * (c - a)).astype(np.float32)
 
 
 def _lend(points: NDArray, colors: NDArray, known: NDArray[np.bool_]) -> NDArray[np.uint8]:
