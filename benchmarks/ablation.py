@@ -178,6 +178,17 @@ def kernel(scene: Scene | None, out: Path) -> None:
 STUDIES = {"encoding": encoding, "voxel-size": voxel_size, "kernel": kernel}
 
 
+def run(
+    studies: Sequence[str], scene_name: str, data: Path | None, frames: int | None, out: Path
+) -> None:
+    """Some of STUDIES on a scene, which the kernel's alone does not need."""
+    uf.init()
+    scene = SCENES[scene_name](data, frames) if set(studies) - {"kernel"} else None
+    for name in studies:
+        print(f"\n{name} ({STUDIES[name].__doc__.partition(':')[0]})\n", flush=True)
+        STUDIES[name](scene, out)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -204,14 +215,7 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     uf.init(threads=options.threads)
-    scene = (
-        SCENES[options.scene](options.data, options.frames)
-        if set(options.only) - {"kernel"}
-        else None
-    )
-    for name in options.only:
-        print(f"\n{name} ({STUDIES[name].__doc__.partition(':')[0]})\n", flush=True)
-        STUDIES[name](scene, options.out)
+    run(options.only, options.scene, options.data, options.frames, options.out)
 
 
 if __name__ == "__main__":

@@ -62,6 +62,10 @@ def quaternion(R: np.ndarray) -> np.ndarray:
     return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 4 * w * w]) / (4 * w)
 
 
+def numbers_of(camera: PinholeCamera) -> tuple[float, ...]:
+    return (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
 def numbers(values) -> str:
     return " ".join(repr(float(value)) for value in np.ravel(values))
 
@@ -97,15 +101,15 @@ def write_seven_scenes(folder: Path, samples: list[Sample]) -> Path:
     return folder
 
 
-def write_replica(folder: Path, samples: list[Sample], images: str = "results") -> Path:
+def write_replica(
+    folder: Path, samples: list[Sample], images: str = "results", camera: PinholeCamera = CAMERA
+) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "traj.txt").write_text(
         "\n".join(numbers(sample.T_world_camera) for sample in samples) + "\n"
     )
-    (folder / "cam_params.json").write_text(
-        '{"camera": {"w": 16, "h": 12, "fx": 15.0, "fy": 14.0, "cx": 7.5, "cy": 5.5, '
-        '"scale": 6553.5}}'
-    )
+    values = dict(zip(("w", "h", "fx", "fy", "cx", "cy"), numbers_of(camera), strict=True))
+    (folder / "cam_params.json").write_text(json.dumps({"camera": values | {"scale": 6553.5}}))
     for i, sample in enumerate(samples):
         write_image(folder / images / f"frame{i:06d}.png", sample.color)
         write_image(folder / images / f"depth{i:06d}.png", sample.units)
@@ -162,7 +166,8 @@ def sens_bytes(
     name: bytes = b"StructureSensor",
     name_bytes: int | None = None,
     frame_count: int | None = None,
-    size: tuple[int, int] = (WIDTH, HEIGHT),
+    size: tuple[int, int] | None = None,
+    camera: PinholeCamera = CAMERA,
     color_compression: int = 1,
     depth_compression: int = 1,
     color_bytes: int | None = None,
@@ -170,12 +175,18 @@ def sens_bytes(
 ) -> bytes:
     """A .sens file; the options write lies into its header or its records."""
     K = np.eye(4, dtype="<f4")
-    K[:3, :3] = CAMERA.matrix
+    K[:3, :3] = camera.matrix
     out = [struct.pack("<IQ", version, len(name) if name_bytes is None else name_bytes), name]
     out += [matrix.astype("<f4").tobytes() for matrix in (np.eye(4), np.eye(4), K, np.eye(4))]
     out.append(
         struct.pack(
-            "<iiIIIIf", color_compression, depth_compression, 2 * WIDTH, 2 * HEIGHT, *size, 1000.0
+            "<iiIIIIf",
+            color_compression,
+            depth_compression,
+            2 * camera.width,
+            2 * camera.height,
+            *(size or camera.size),
+            1000.0,
         )
     )
     out.append(struct.pack("<Q", len(samples) if frame_count is None else frame_count))
@@ -204,9 +215,14 @@ def sens_bytes(
     return b"".join(out)
 
 
-def write_sens(folder: Path, samples: list[Sample]) -> Path:
+def write_sens(
+    folder: Path,
+    samples: list[Sample],
+    name: str = "scene0000_00",
+    camera: PinholeCamera = CAMERA,
+) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "scene0000_00.sens").write_bytes(sens_bytes(samples))
+    (folder / f"{name}.sens").write_bytes(sens_bytes(samples, camera=camera))
     return folder
 
 
