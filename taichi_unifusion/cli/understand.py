@@ -23,8 +23,8 @@ class Understand(Reconstruct):
     """
 
     features: Annotated[str, arg(metavar="ENCODER")] = field(kw_only=True)
-    """What makes features: clip:MODEL (a folder, or a name with --download), onnx:FILE.onnx, or
-    folder:PATH of saved ones.
+    """What makes features: clip:MODEL (a folder, or a name with --download), onnx:FILE.onnx,
+    folder:PATH of saved ones, or points:FILE,POINTS.ply of features at points.
     """
     method: Literal["dense", "crops"] = field(default="dense", kw_only=True)
     """clip: features of every patch in one go, or of overlapping windows at several scales (slow,

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from ..errors import FileError, InputError, MissingDependency
 from .atomic import read_bytes
 
+POINT_FEATURES = ("feat", "mask_full")  # names in OpenScene's files
+
 
 def read_array(path: str | os.PathLike[str]) -> NDArray[Any]:
     """The array in a .npy file; raises FileError where it is missing, damaged or holds objects,
@@ -108,8 +110,57 @@ def _slices(
         yield np.frombuffer(data, dtype).reshape(shape[1:])
 
 
+def read_point_features(
+    path: Path,
+) -> tuple[NDArray[np.floating[Any]], NDArray[np.bool_] | None]:
+    """Features (M, c) of points, and which (N,) of all points these M are, None: all.
+
+    A .npy holds features of all points; a .npz or .pt, as OpenScene has it, `feat` (M, c) and
+    `mask_full` (N,). Raises as `open_planes`.
+    """
+    mask = None
+    if path.suffix == ".pt":
+        stored = _load_torch(path)
+        if isinstance(stored, dict):
+            values = [stored[name] for name in POINT_FEATURES if hasattr(stored.get(name), "numpy")]
+            if len(values) < len(POINT_FEATURES):
+                raise InputError(f"{path}: expected tensors {' and '.join(POINT_FEATURES)} in it")
+            features, mask = (value.numpy() for value in values)
+        else:
+            features = stored.numpy() if hasattr(stored, "numpy") else None
+    elif path.suffix == ".npz":
+        archive = read_archive(path)
+        if not set(POINT_FEATURES) <= set(archive.files):
+            raise InputError(f"{path}: must hold arrays {' and '.join(POINT_FEATURES)}")
+        try:
+            features, mask = (archive[name] for name in POINT_FEATURES)
+        except (ValueError, zipfile.BadZipFile) as error:
+            raise FileError(f"{path}: a damaged file, or Python objects ({error})") from None
+    else:
+        features = read_array(path)
+    if features is not None and features.ndim == 3 and features.shape[2] == 1:
+        features = features[..., 0]  # as OpenScene's first files have it
+    if features is None or features.ndim != 2 or features.dtype.kind != "f":
+        raise InputError(f"{path}: features of points must be (M, c) floating-point numbers")
+    if mask is not None and (mask.ndim != 1 or mask.dtype != bool or mask.sum() != len(features)):
+        raise InputError(
+            f"{path}: its mask must say which points the {len(features)} features are of"
+        )
+    return features, mask
+
+
 def _open_torch(path: Path) -> Any:
     """The one tensor in a file of torch."""
+    array = _load_torch(path)
+    if not hasattr(array, "is_floating_point") or not array.is_floating_point():
+        raise InputError(
+            f"{path}: holds {type(array).__name__}, expected one tensor of floating-point numbers"
+        )
+    return array.squeeze(0) if array.ndim == 4 and array.shape[0] == 1 else array
+
+
+def _load_torch(path: Path) -> Any:
+    """What a file of torch holds, mapped rather than read."""
     try:
         import torch  # pyright: ignore[reportMissingImports] - an extra, often not installed
     except ImportError:
@@ -117,16 +168,11 @@ def _open_torch(path: Path) -> Any:
             f"{path}: .pt files are read by torch: pip install torch, or save .npy"
         ) from None
     if not path.exists():
-        raise FileNotFoundError
+        raise FileError(f"{path}: no such file")
     try:
-        array = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:  # noqa: BLE001 - torch has a class of its own for every kind
         line = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
         raise FileError(
             f"{path}: not a tensor that torch reads safely, without running code ({line})"
         ) from None
-    if not isinstance(array, torch.Tensor) or not array.is_floating_point():
-        raise InputError(
-            f"{path}: holds {type(array).__name__}, expected one tensor of floating-point numbers"
-        )
-    return array.squeeze(0) if array.ndim == 4 and array.shape[0] == 1 else array

@@ -33,6 +33,7 @@ IMAGE_ENCODERS = {  # name -> module, its function, what stands after the colon
     ),
     "onnx": ("..networks.onnx_encoders", "onnx_image_encoder", "FILE.onnx"),
     "folder": (".folder", "folder_features", "FOLDER of .npy, .npz or .pt files"),
+    "points": (".points", "point_features", "FEATURES,POINTS.ply: .pt, .npz or .npy, and where"),
 }
 TEXT_ENCODERS = {
     "clip": (
