@@ -24,7 +24,7 @@ from typing import Any
 
 import paper_pictures as pictures
 from paper_experiments import METHODS, S3DIS_CLASSES, SURFACE, Experiment, Settings
-from paper_runs import Results, column, read_results, run_scenes
+from paper_runs import STOPPED, Results, column, read_results, run_scenes
 from paper_scenes import read_list
 from paper_tables import (
     NOTHING,
@@ -274,7 +274,7 @@ def _add_table(commands: Any, table: Table) -> None:
         help=f"{', '.join(METHODS)} or FILE.yaml (default: ours)",
     )
     one.add_argument("--every", type=int, metavar="N", help="map every N-th frame")
-    if any(each.settings.tracking != "given" for each in table.experiments):
+    if table.number == "III":  # of Table II it is what is measured
         one.add_argument(
             "--tracking", choices=("given", "internal", "rgbd"), help="camera poses (default: rgbd)"
         )
@@ -305,6 +305,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     try:
         return options.run(options)
+    except KeyboardInterrupt:
+        print("paper: stopped; the same command goes on with what is not done yet")
+        return STOPPED
     except UniFusionError as error:
         raise SystemExit(f"paper: {error}") from None
 

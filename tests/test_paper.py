@@ -215,6 +215,16 @@ def test_classes_of_scannet_and_s3dis(tmp_path, here, mini, capsys):
     assert (tmp_path / "out" / "s3dis-classes" / "mini" / "area_1-office_1" / "maps").is_dir()
 
 
+def test_ctrl_c_ends_all_and_keeps_what_is_done(tmp_path, mini, monkeypatch, capsys):
+    def unifusion(command: list[str], log: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(paper_runs, "unifusion", unifusion)
+    root = write_tum_root(tmp_path / "tum", count=1)
+    assert paper.main(["II", str(root), *mini]) == 130
+    assert "the same command goes on" in capsys.readouterr().out
+
+
 def test_points_of_all_scenes_count_once_each():
     """Scores are of the points of all scenes together, not means of the scenes' scores."""
     labels = list(SCANNET20.names)

@@ -49,6 +49,22 @@ def fused(frames):
     return pipeline, pipeline.run(frames)
 
 
+def test_maps_that_take_every_point_need_no_window(frames):
+    """As published: nothing is summed up, whether the window is of one frame or of several."""
+    published = replace(
+        CONFIG,
+        surface=replace(CONFIG.surface, sampling="points"),
+        color=replace(CONFIG.color, sampling="points"),
+    )
+    few = np.zeros_like(frames[0].depth)
+    few[40:80, 60:100] = frames[0].depth[40:80, 60:100]
+    for window in (1, 2):
+        pipeline = Pipeline(replace(published, window=window))
+        run = pipeline.run([replace(frames[0], depth=few)] * 2)
+        assert len(run.steps) == 2 and run.failure is None
+        assert len(pipeline.surface) and len(pipeline.properties["color"])
+
+
 class Sequence:
     """Frames, or errors raised in their place, that note when and where they are loaded."""
 

@@ -91,7 +91,7 @@ class Window:
     @property
     def full(self) -> bool:
         """Whether there is no room for another frame."""
-        most = max(each.bytes for each in self.parts.values())
+        most = max((each.bytes for each in self.parts.values()), default=0)
         return len(self) == self.images.shape[0] or most > ROOM
 
     def is_near(self, frame: Frame) -> bool:
