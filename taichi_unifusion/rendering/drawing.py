@@ -111,10 +111,9 @@ class Drawable:
             camera.intrinsics,
             drawn.nearest,
             depth,
-            thinned,
             (*light, self.shading),
             OCCLUSION_RADIUS,
-            OCCLUSION_TAPS if occluded else 0,
+            (OCCLUSION_TAPS if occluded else 0, thinned),
             background,
             image,
         )

@@ -85,10 +85,9 @@ def test_shade_pixels_equals_its_twin(radius):
         finer.intrinsics,
         buffer.nearest,
         depth,
-        thinned,
         (*light, look["shading"]),
         look["radius"],
-        look["taps"],
+        (look["taps"], thinned),
         look["background"],
         image,
     )

@@ -189,11 +189,11 @@ def shade_pixels(
     T_camera_world: Pose,  # (3, 4)
     intrinsics: Intrinsics,  # of the depth buffer
     nearest: DepthBuffer,  # (s H, s W)
-    depth: Floats2,  # (h, w) [m] of every `thinned`-th pixel of it, 0: none
-    thinned: ti.i32,
+    depth: Floats2,  # (h, w) [m] of some pixels of it, 0: none
     light: ti.math.vec4,  # unit direction to it, camera frame; how much it changes colours, 0..1
     radius: ti.f32,  # of ambient occlusion [m]
-    taps: ti.i32,  # depths looked at for it, a surface in a pixel; 0: none is wanted
+    # depths looked at for it, a surface in a pixel, 0: none is wanted; every how many-th pixel has one
+    taps: ti.math.ivec2,
     background: ti.math.vec3,  # RGB in [0, 1]
     # out:
     image: Image,  # (H, W, 3) RGB
@@ -226,8 +226,8 @@ def shade_pixels(
                 n /= n.norm() + 1e-9
                 lit = 0.5 + 0.5 * n.dot(light.xyz)  # half Lambert: nothing falls into black
                 z = depth_of(nearest[v, u])
-                if taps > 0 and ti.abs(z - hidden_at) > ONE_SURFACE * z:
-                    hidden = occlusion(depth, v, u, z, n, intrinsics, radius, taps, thinned)
+                if taps[0] > 0 and ti.abs(z - hidden_at) > ONE_SURFACE * z:
+                    hidden = occlusion(depth, v, u, z, n, intrinsics, radius, taps[0], taps[1])
                     hidden_at = z
                 rgb *= 1.0 - light[3] + light[3] * lit * LIFT
                 rgb *= 1.0 - OCCLUSION_SHARE * hidden
