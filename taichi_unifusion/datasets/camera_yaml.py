@@ -4,15 +4,14 @@ are. Strict.
 
 from __future__ import annotations
 
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import get_type_hints
 
-from ..errors import DatasetError, FileError, InputError, convert, did_you_mean
+from ..errors import DatasetError
 from ..files.images import INVALID_DEPTH
-from ..files.strict_yaml import read_yaml
 from ..types import PinholeCamera
 from .depth_camera import make_camera
+from .fields import read_fields
 
 
 @dataclass(frozen=True)
@@ -43,26 +42,4 @@ def read_camera_yaml(path: Path) -> CameraFile:
             f"{path}: no such file; it holds width, height, fx, fy, cx, cy of the depth images, "
             "see docs/formats.md"
         )
-    types, required = get_type_hints(CameraFile), _required_keys()
-    try:
-        values = read_yaml(path)
-        if not isinstance(values, dict):
-            raise DatasetError(f"{path}: expected lines of the form 'fx: 525.0'")
-        for key in values:
-            if key not in types:
-                raise DatasetError(
-                    f"{path}: unknown key '{str(key)[:40]}'{did_you_mean(key, types)} "
-                    f"(keys: {', '.join(types)})"
-                )
-        missing = [key for key in required if key not in values]
-        if missing:
-            raise DatasetError(f"{path}: no {', '.join(missing)} in it")
-        return CameraFile(
-            **{key: convert(value, types[key], f"{path}: {key}") for key, value in values.items()}
-        )
-    except (FileError, InputError) as error:
-        raise DatasetError(str(error)) from None
-
-
-def _required_keys() -> list[str]:
-    return [field.name for field in fields(CameraFile) if field.default is MISSING]
+    return read_fields(path, CameraFile)

@@ -130,26 +130,43 @@ def color_for_depth(
     It does not where the point lies outside its image or behind something nearer. Pixels without a
     reading are coloured as if they had their neighbours', so that the picture is whole.
     """
-    color_camera = lens.pinhole
-    columns, rows, z = project_depth(_filled(depth), camera, color_camera, T_color_camera)
-    width, height = color_camera.size
-    inside = (columns > -0.5) & (rows > -0.5) & (columns < width - 0.5) & (rows < height - 0.5)
-    # without the outermost pixels, which interpolation mixes with black
-    covered = cv2.erode(lens.sees(color_camera).astype(np.uint8), np.ones((3, 3)))
-    covered = cv2.remap(covered, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-    known = inside & (depth > 0)
-    # [pixels of the colour camera] so wide that each cell has at least one reading
-    cell = 2 * max(color_camera.fx / camera.fx, 0.5)
-    at = tuple(
-        np.where(inside, np.maximum(pixels, 0) / cell, 0).astype(np.int32)
-        for pixels in (rows, columns)
-    )
-    nearest = np.full((int(height / cell) + 1, int(width / cell) + 1), np.inf, np.float32)
-    np.minimum.at(nearest, (at[0][known], at[1][known]), z[known])
-    seen = known & (covered > 0) & (z <= (1 + HIDDEN) * cv2.erode(nearest, np.ones((3, 3)))[at])
-    undistorted = lens.undistort(color, color_camera)
-    moved = cv2.remap(undistorted, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    target = lens.pinhole
+    columns, rows, z = project_depth(_filled(depth), camera, target, T_color_camera)
+    width, height = target.size
+    # the outermost pixels count as outside: interpolation mixes them with black
+    inside = (columns > 0.5) & (rows > 0.5) & (columns < width - 1.5) & (rows < height - 1.5)
+    if any(lens.distortion):
+        columns, rows = (
+            np.asarray(cv2.remap(each, columns, rows, cv2.INTER_LINEAR, borderValue=-2), np.float32)
+            for each in _undistortion(lens, target)
+        )
+        inside &= (columns > 0.5) & (rows > 0.5) & (columns < width - 1.5) & (rows < height - 1.5)
+    seen = inside & (depth > 0) & _in_front(columns, rows, z, inside & (depth > 0), camera, target)
+    moved = cv2.remap(color, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     return np.asarray(moved, np.uint8), seen
+
+
+def _in_front(
+    columns: NDArray[np.float32],
+    rows: NDArray[np.float32],
+    z: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    camera: PinholeCamera,
+    target: PinholeCamera,
+) -> NDArray[np.bool_]:
+    """Which readings (H, W) of `camera` nothing hides from `target`, by a depth buffer: they land at
+    these columns and rows with these depths [m]; only `known` ones count and can hide.
+    """
+    # [pixels of the target] three of them are so wide that there is at least one reading
+    cell = np.float32(max(target.fx / camera.fx, 0.5))
+    shape = int(target.height / cell) + 1, int(target.width / cell) + 1
+    at = np.where(known, rows / cell, 0).astype(np.intp) * shape[1]
+    at += np.where(known, columns / cell, 0).astype(np.intp)
+    nearest = np.full(shape, np.inf, np.float32)
+    # in one dimension, which NumPy does ten times faster
+    np.minimum.at(nearest.ravel(), at[known], z[known])
+    around = cv2.erode(nearest, np.ones((3, 3)))
+    return z / np.float32(1 + HIDDEN) <= np.take(around, at)
 
 
 def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
