@@ -14,7 +14,8 @@ PUBLIC = {
         preprocess warm_up
     """,
     "taichi_unifusion.datasets": """
-        Dataset DatasetView FORMATS FormatOption format_options open_dataset parse_options
+        ColorCamera ColorEstimate Dataset DatasetView FORMATS FormatOption
+        estimate_color_camera format_options open_dataset parse_options
     """,
     "taichi_unifusion.evaluation": """
         RenderingResult SegmentationResult SurfaceResult TrajectoryResult Viewpoints

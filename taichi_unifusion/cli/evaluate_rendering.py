@@ -13,6 +13,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from ..datasets import Dataset, open_dataset
 from ..errors import FrameError, InputError
 from ..results.tables import format_table
+from .color_camera import CHOICES as COLOR_CHOICES
+from .color_camera import found_color, given_color
 from .options import FORMAT_DEFAULT, ONE_EACH, Device, ScoreOptions, frames_asked, merged_options
 from .scores import cell, check_out, percent, show
 from .terminal import frame_progress
@@ -76,6 +78,11 @@ class EvaluateRendering:
         UseAppendAction[tuple[str, ...]], arg(metavar="KEY=VALUE", help_behavior_hint=ONE_EACH)
     ] = ()
     """Another option of the recording's format, as of `unifusion reconstruct`."""
+    color_camera: Annotated[
+        str | None,
+        arg(metavar=COLOR_CHOICES, help_behavior_hint="(default: the run's, else none)"),
+    ] = None
+    """The colour camera that images are registered with, as of `unifusion reconstruct`."""
     vertex_colors: FlagCreatePairsOff[bool] = False
     """Judge the colours of the mesh's vertices instead of the colour map."""
     device: Device = "auto"
@@ -97,6 +104,8 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     run = find_run(options.reconstruction)
     mesh = run.mesh() if run else read_any_mesh(options.reconstruction)
     recording, run = _recording(options, run)
+    if options.color_camera is not None:
+        recording, _ = found_color(*given_color(recording, options.color_camera))
     for sentence in recording.warnings:
         logger.warning("%s", sentence)
     chosen = choose_frames(options, run, recording)
@@ -159,11 +168,15 @@ def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Ru
     given = merged_options(format, given, options.option)
     if run is None:
         return open_dataset(format, options.path, **given), None
-    known = run.source.reading if run.source.format == format else {}
-    path = run.source.path if options.format is None else str(options.path or "")
-    run = replace(
-        run, source=replace(run.source, format=format, path=path, reading={**known, **given})
+    same = run.source.format == format
+    source = replace(
+        run.source,
+        format=format,
+        path=run.source.path if options.format is None else str(options.path or ""),
+        reading={**(run.source.reading if same else {}), **given},
+        color=run.source.color if same and options.color_camera is None else None,
     )
+    run = replace(run, source=source)
     return run.recording, run
 
 

@@ -15,8 +15,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from ..config import Config
 from ..datasets import FORMATS, Dataset, format_options, open_dataset, parse_options
 from ..errors import DatasetError, InputError
-from ..results.record import Source
+from ..results.record import ColorRecord, Source
 from ..tracking import Mode
+from .color_camera import AUTO, ColorChoice
 
 FORMAT_DEFAULT = "(default: the format's)"
 OPTIONAL = "(optional)"
@@ -62,6 +63,10 @@ class RecordingOptions:
         Path | None, arg(metavar="FILE", help_behavior_hint="(scene needs one)")
     ] = None
     """Poses to render a scene from: lines 'timestamp tx ty tz qx qy qz qw', camera to world."""
+    color_camera: ColorChoice = AUTO
+    """Where the colour camera stands. auto: found from the frames, and used if colour then fits depth better in
+    frames left out; FILE: your calibration; kinect: a Kinect's nominal one; none: colour as recorded.
+    """
     strict: FlagCreatePairsOff[bool] = False
     """Stop at the first frame that cannot be used, instead of skipping it."""
 
@@ -155,7 +160,7 @@ def open_recording(options: RecordingOptions) -> Dataset:
     return recording[asked.start : options.end]
 
 
-def source_of(options: RecordingOptions, frames: int) -> Source:
+def source_of(options: RecordingOptions, frames: int, color: ColorRecord | None = None) -> Source:
     """What the record of a run keeps of the recording; `frames` were asked for."""
     return Source(
         format=options.format,
@@ -168,6 +173,7 @@ def source_of(options: RecordingOptions, frames: int) -> Source:
             for name, value in reading_options(options).items()
         },
         frames=frames,
+        color=color,
     )
 
 

@@ -14,6 +14,7 @@ from ..config import Config
 from ..datasets import Dataset
 from ..geometry.gravity import Up, parse_up
 from ..tracking import check_poses, track
+from .color_camera import found_color, given_color
 from .interrupts import INTERRUPTED, stop_on_signal
 from .options import (
     OutputOptions,
@@ -29,6 +30,7 @@ from .viewing import WatchOptions, open_watcher
 if TYPE_CHECKING:
     from ..networks.encoders import ImageEncoder
     from ..results import RunFolder
+    from ..results.record import ColorRecord
     from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
@@ -65,6 +67,7 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     also a map of its features.
     """
     check_poses(recording, options.poses.tracking, options.poses.trajectory)
+    recording, color = given_color(recording, options.recording.color_camera)
     from ..results.writer import prepare_results, remove_temporaries
 
     up = parse_up(options.output.up) if options.output.up else None
@@ -79,7 +82,7 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
         watcher = open_watcher(options.watch, folder.path.name, frames, stop)
         try:
-            code = _fuse_and_write(recording, options, folder, stop, encoder, up, watcher)
+            code = _fuse_and_write(recording, color, options, folder, stop, encoder, up, watcher)
         except BaseException:
             watcher.close()
             raise
@@ -92,6 +95,7 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
 
 def _fuse_and_write(
     recording: Dataset,
+    color: ColorRecord,
     options: Reconstruct,
     folder: RunFolder,
     stop: Callable[[], bool],
@@ -107,8 +111,9 @@ def _fuse_and_write(
     if options.poses.tracked:
         recording, tracking = _track(recording, options, folder, stop)
         written = folder.tracking_files
+    recording, color = found_color(recording, color)
     frames = recording[:: options.recording.every]
-    source = source_of(options.recording, len(frames))
+    source = source_of(options.recording, len(frames), color)
     pipeline = Pipeline(options.settings, encoder=encoder)
     with frame_progress(len(frames)) as on_frame:
         run = pipeline.run(

@@ -10,10 +10,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+import lazy_loader
 
 from ..errors import DatasetError, InputError, convert, did_you_mean, is_convertible
 from .dataset import Dataset, DatasetView
+
+if TYPE_CHECKING:
+    from .color_camera import ColorCamera
+    from .color_estimation import ColorEstimate, estimate_color_camera
 
 FORMATS = {  # name -> module here, what opens a recording
     "synthetic": ("synthetic", "SyntheticRoom"),
@@ -45,13 +51,24 @@ SENTENCES = {  # what an option of open_dataset means, the same in every format 
 
 __all__ = [
     "FORMATS",
+    "ColorCamera",
+    "ColorEstimate",
     "Dataset",
     "DatasetView",
     "FormatOption",
+    "estimate_color_camera",
     "format_options",
     "open_dataset",
     "parse_options",
 ]
+
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__,
+    submod_attrs={
+        "color_camera": ["ColorCamera"],
+        "color_estimation": ["ColorEstimate", "estimate_color_camera"],
+    },
+)
 
 
 @dataclass(frozen=True)

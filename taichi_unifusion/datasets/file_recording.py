@@ -7,12 +7,16 @@ The modules of the formats list the files; loading them is the same for all.
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DatasetError, FrameError, InputError
 from ..files.images import (
@@ -21,12 +25,13 @@ from ..files.images import (
     read_color,
     read_depth,
     read_infrared,
-    resize_color,
     resize_image,
 )
 from ..files.trajectories import Pose
+from ..geometry.velocities import FRAME_RATE
 from ..types import Frame, PinholeCamera
-from .dataset import Dataset
+from .camera_pair import CameraPair
+from .color_camera import ColorCamera
 from .plausibility import camera_warnings, pose_warnings
 
 SIZE_SAMPLES = 5  # depth headers to read; the size that most have counts
@@ -43,11 +48,12 @@ class FrameFiles:
     infrared: Path | None = None
 
 
-class Recording(Dataset):
+class Recording(CameraPair):
     """Frames read from files when indexed.
 
     `depth_scale` is in units a metre, `invalid` the units that mean no reading, `fit_color`
     resamples colour of another size, `no_poses` says what is missing where no frame has a pose.
+    `color_camera` is the colour camera's own, where colour is not registered to depth yet.
     """
 
     def __init__(
@@ -62,6 +68,7 @@ class Recording(Dataset):
         drop_alpha: bool = False,
         warnings: Iterable[str] = (),
         no_poses: str = "",
+        color_camera: ColorCamera | None = None,
     ) -> None:
         self.name, self.frames, self.camera = name, tuple(frames), camera
         self.depth_scale = check_depth_scale(depth_scale, name)
@@ -74,6 +81,7 @@ class Recording(Dataset):
             else tuple(pose_warnings(poses))
         )
         self.warnings = (*warnings, *camera_warnings(camera), *self.pose_warnings)
+        self.register_with(color_camera)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -81,25 +89,37 @@ class Recording(Dataset):
     def without_poses(self) -> Recording:
         """The same frames, their poses left out; so are the warnings about those."""
         bare = copy(self)
+        bare.twists = None  # nothing that follows from poses
         bare.frames = tuple(replace(frame, pose=None) for frame in self.frames)
         bare.warnings = tuple(
             warning for warning in self.warnings if warning not in self.pose_warnings
         )
         return bare
 
+    def pose_at(self, index: int) -> tuple[float | None, NDArray[np.float64] | None]:
+        files = self.frames[index]
+        time = files.timestamp
+        if time is None and (number := re.search(r"\d+", files.depth.name)):
+            time = int(number[0]) / FRAME_RATE
+        return time, files.pose.usable if files.pose else None
+
     def load(self, index: int) -> Frame:
         """Read frame `index`; FrameError (PoseError, SizeMismatch) names the faulty file."""
         files = self.frames[index]
         T_world_camera = files.pose.checked() if files.pose else None
         depth = read_depth(files.depth, self.depth_scale, self.invalid)
-        color = None
+        frame = Frame(
+            depth,
+            self.camera,
+            None,
+            T_world_camera,
+            index,
+            files.timestamp,
+            str(files.depth),
+        )
         if files.color is not None:
             color = read_color(files.color, drop_alpha=self.drop_alpha)
-            if self.fit_color:
-                color = resize_color(color, depth.shape[1], depth.shape[0], str(files.color))
-        frame = Frame(
-            depth, self.camera, color, T_world_camera, index, files.timestamp, str(files.depth)
-        )
+            frame = self.with_color(frame, color, str(files.color))
         # infrared may be missing for single frames
         if files.infrared is None or not files.infrared.exists():
             return frame

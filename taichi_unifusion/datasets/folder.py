@@ -3,12 +3,12 @@ poses.
 
 Depth: `depth/NAME.png`, 16 bits, `depth_scale` units a metre (default 1000), 0 and 65535 no
 reading; or `depth/NAME.npy`, floats in metres. Colour: `color/NAME.png` or `.jpg`, registered to
-depth; another size of the same shape is resampled. Frames are the names, in the order of the
-numbers in them. Infrared, if any: `infrared/NAME.png`, one channel of 8 or 16 bits, registered to
-depth, for the frames that have one. Poses: camera-to-world in metres, camera x right, y down, z
-forward, as `poses/NAME.txt` (4x4 each), or `poses.txt` with rows `NAME tx ty tz qx qy qz qw` (a
-name that is a number may be a time stamp, matched within max_difference), or `poses.txt` with one
-row of 16 numbers for every frame, in their order.
+depth, where another size of the same shape is resampled, or, beside a `color_camera.yaml`, as that
+camera took it. Frames are the names, in the order of the numbers in them. Infrared, if any:
+`infrared/NAME.png`, one channel of 8 or 16 bits, registered to depth, for the frames that have one.
+Poses: camera-to-world in metres, camera x right, y down, z forward, as `poses/NAME.txt` (4x4 each),
+or `poses.txt` with rows `NAME tx ty tz qx qy qz qw` (a name that is a number may be a time stamp,
+matched within max_difference), or `poses.txt` with one row of 16 numbers for every frame, in their order.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from ..files.trajectories import REPLICA, TUM, Pose, PoseRow, read_pose_file, re
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..types import PinholeCamera
 from .camera_yaml import CameraFile, read_camera_yaml
+from .color_camera import read_color_camera
 from .depth_camera import check_size
 from .file_recording import FrameFiles, Recording, depth_size
 
@@ -36,7 +37,7 @@ DEPTH_SUFFIXES, COLOR_SUFFIXES, INFRARED_SUFFIXES = (
     (".png",),
 )
 MAX_DIFFERENCE = 0.02  # [s]
-CAMERA_FILE = "camera.yaml"
+CAMERA_FILE, COLOR_CAMERA_FILE = "camera.yaml", "color_camera.yaml"
 
 
 def open_folder(
@@ -67,6 +68,7 @@ def open_folder(
         for stem, pose in zip(stems, poses, strict=True)
     ]
     source = str(path / CAMERA_FILE) if camera is None else "camera"
+    own = path / COLOR_CAMERA_FILE
     camera = check_size(camera or settings.camera(source), depth_size(frames), source)
     return Recording(
         f"folder {path}",
@@ -77,6 +79,7 @@ def open_folder(
         fit_color=True,
         drop_alpha=drop_alpha,
         no_poses="" if any(poses) else f"{path}: no poses.txt and no poses/ here",
+        color_camera=read_color_camera(own) if own.exists() else None,
     )
 
 

@@ -80,6 +80,8 @@ class Capture:
 class K4aFile(Dataset):
     """The frames of an Azure Kinect recording, each read when asked for."""
 
+    registered = True
+
     def __init__(self, path: Path, align: str, depth_scale: float, max_difference: float) -> None:
         self.name, self.path, self.align, self.depth_scale = f"k4a {path}", path, align, depth_scale
         contents = read_contents(path)

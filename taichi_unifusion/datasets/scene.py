@@ -27,7 +27,7 @@ class SceneDataset(Dataset):
     else. `classes` names the class of objects; one that it leaves out is its own class.
     """
 
-    runs_kernels = True
+    runs_kernels = registered = True
 
     def __init__(
         self,

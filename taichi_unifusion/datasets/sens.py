@@ -8,17 +8,20 @@ from __future__ import annotations
 from copy import copy
 from pathlib import Path
 
-from ..files.images import INVALID_DEPTH, depth_to_metres, resize_color
+import numpy as np
+from numpy.typing import NDArray
+
+from ..files.images import INVALID_DEPTH, depth_to_metres
 from ..files.sens_container import decode_sens_color, decode_sens_depth, open_sens, read_images
 from ..files.trajectories import Pose
 from ..types import Frame, PinholeCamera
-from .dataset import Dataset
+from .camera_pair import CameraPair
 from .depth_camera import check_size, make_camera
 from .file_recording import check_depth_scale
 from .plausibility import camera_warnings, pose_warnings
 
 
-class SensFile(Dataset):
+class SensFile(CameraPair):
     """The frames of a .sens file, each read when asked for."""
 
     def __init__(
@@ -50,8 +53,11 @@ class SensFile(Dataset):
     def without_poses(self) -> SensFile:
         """The same frames, their poses left out; so are the warnings about those."""
         bare = copy(self)
-        bare.poses, bare.warnings = None, self.other_warnings
+        bare.poses, bare.twists, bare.warnings = None, None, self.other_warnings
         return bare
+
+    def pose_at(self, index: int) -> tuple[float | None, NDArray[np.float64] | None]:
+        return self.records[index].timestamp, self.poses[index].usable if self.poses else None
 
     def load(self, index: int) -> Frame:
         """Read frame `index`; FrameError names the file and the frame."""
@@ -60,10 +66,10 @@ class SensFile(Dataset):
         color_data, depth_data = read_images(self.path, record)
         raw = decode_sens_depth(depth_data, self.header, f"{where} depth")
         depth = depth_to_metres(raw, f"{where} depth", self.depth_scale, INVALID_DEPTH)
-        color = None
-        if record.color_bytes:
-            color = decode_sens_color(
-                color_data, self.header, f"{where} colour", drop_alpha=self.drop_alpha
-            )
-            color = resize_color(color, *self.header.depth_size, f"{where} colour")
-        return Frame(depth, self.camera, color, T_world_camera, index, record.timestamp, where)
+        frame = Frame(depth, self.camera, None, T_world_camera, index, record.timestamp, where)
+        if not record.color_bytes:
+            return frame
+        color = decode_sens_color(
+            color_data, self.header, f"{where} colour", drop_alpha=self.drop_alpha
+        )
+        return self.with_color(frame, color, f"{where} colour")

@@ -74,6 +74,8 @@ def open_stanford(
 class StanfordArea(Dataset):
     """The images of an area or a room, each with a camera of its own, read when asked for."""
 
+    registered = True
+
     def __init__(
         self,
         folder: Path,

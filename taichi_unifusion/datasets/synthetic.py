@@ -41,7 +41,7 @@ class SyntheticRoom(Dataset):
     not positive.
     """
 
-    runs_kernels = True
+    runs_kernels = registered = True
 
     def __init__(
         self,

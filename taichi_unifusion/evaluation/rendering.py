@@ -43,7 +43,7 @@ class FrameScore:
     depth_l1_cm: float | None  # mean |rendered - read| where there are both
     depth_median_cm: float | None  # median of the same
     depth_within: float | None  # share of all readings, 0..1, with a hit less than 2.5 cm off
-    psnr_db: float | None  # of colour where there are a reading and a hit
+    psnr_db: float | None  # of colour where there are a reading, a hit and a colour of the reading
     ssim: float | None  # mean over the same pixels
 
 
@@ -138,9 +138,12 @@ def _score(rendered: RenderedFrame, frame: Frame, depth_min: float, depth_max: f
         (100 * float(error.mean()), 100 * float(np.median(error))) if compared else (None, None)
     )
     psnr_db = structure = None
-    if compared and rendered.color is not None and frame.color is not None:
-        taken = frame.color.astype(np.float32) / np.float32(255)
-        psnr_db, structure = psnr(rendered.color, taken, both), ssim(rendered.color, taken, both)
+    if rendered.color is not None and frame.color is not None:
+        taken, known = _taken_color(frame, frame.color)
+        known &= both
+        if known.any():
+            psnr_db = psnr(rendered.color, taken, known)
+            structure = ssim(rendered.color, taken, known)
     return FrameScore(
         frame.index,
         readings,
@@ -151,6 +154,19 @@ def _score(rendered: RenderedFrame, frame: Frame, depth_min: float, depth_max: f
         psnr_db,
         structure,
     )
+
+
+def _taken_color(
+    frame: Frame, picture: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """A frame's colour (H, W, 3) RGB in [0, 1], and where (H, W) it is that of the reading: the
+    colour camera may not see it.
+    """
+    image = frame.images.get("color")
+    if image is None:
+        return picture.astype(np.float32) / np.float32(255), np.ones(frame.depth.shape, np.bool_)
+    known = np.isfinite(image.sum(axis=2))
+    return np.where(known[..., None], image, np.float32(0)), np.asarray(known)
 
 
 def psnr(image: NDArray, reference: NDArray, mask: NDArray[np.bool_]) -> float:

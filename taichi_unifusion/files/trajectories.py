@@ -48,6 +48,14 @@ class Pose:
             raise PoseError(f"{self.source}: {self.problem}")
         return check_rigid(self.T_world_camera, self.source)
 
+    @property
+    def usable(self) -> NDArray[np.float64] | None:
+        """T_world_camera as a rigid transform, None where it cannot be used."""
+        try:
+            return self.checked()
+        except PoseError:
+            return None
+
 
 @dataclass(frozen=True)
 class PoseRow:

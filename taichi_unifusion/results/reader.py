@@ -22,7 +22,7 @@ from ..files.trajectories import read_trajectory
 from ..geometry.gravity import Up
 from ..types import Mesh, Trajectory
 from .outlook import read_up
-from .record import Source, read_record
+from .record import ColorRecord, Source, read_record
 from .run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
@@ -44,7 +44,8 @@ class Run:
         """The recording that the run read; raises DatasetError where it is no longer there."""
         source = self.source
         try:
-            return open_dataset(source.format, source.path or None, **source.reading)
+            opened = open_dataset(source.format, source.path or None, **source.reading)
+            return registered_as(opened, source.color)
         except DatasetError as error:
             raise DatasetError(
                 f"{self.folder.path} was made from {source.format} {source.path}, which cannot be opened: "
@@ -118,6 +119,19 @@ class Run:
             limits.depth_min,
             limits.depth_max,
         )
+
+
+def registered_as(recording: Dataset, color: ColorRecord | None) -> Dataset:
+    """The recording with its colour registered as a run's was."""
+    from ..datasets.color_camera import ColorCamera
+
+    if color is None or (color.camera is None and color.choice != "none"):
+        return recording
+    if color.camera is None:
+        return recording.with_color_camera(None)
+    return recording.with_color_camera(
+        ColorCamera.from_values(color.camera, "the record of the run")
+    )
 
 
 def find_run(path: Path) -> Run | None:

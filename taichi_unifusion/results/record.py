@@ -15,6 +15,17 @@ from ..files.atomic import read_bytes, write_text
 SCHEMA_VERSION = 1  # files without a number are older, and are read as version 1
 
 
+@dataclass(frozen=True)
+class ColorRecord:
+    """Which colour camera the images were registered with, and why."""
+
+    choice: str  # as asked for: auto, kinect, none or a file
+    camera: Mapping[str, Any] | None = None  # a ColorCamera as values; None: colour as recorded
+    verdict: str = ""
+    gain_db: float | None = None  # of an estimate, on frames left out
+    frames: int = 0  # how many these were
+
+
 @dataclass(frozen=True, kw_only=True)
 class Source:
     """Which frames of which recording were asked for, and how it was opened."""
@@ -27,6 +38,7 @@ class Source:
     # options of `open_dataset` as JSON values
     reading: Mapping[str, Any] = field(default_factory=dict)
     frames: int  # how many these are
+    color: ColorRecord | None = None  # None: as the recording gives it
 
     @property
     def asked(self) -> range:

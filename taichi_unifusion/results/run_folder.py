@@ -40,6 +40,11 @@ class RunFolder:
         return self.path / "tracking.txt"
 
     @property
+    def color_camera(self) -> Path:
+        """The colour camera that images were registered with, where there is one."""
+        return self.path / "color_camera.yaml"
+
+    @property
     def map_folder(self) -> Path:
         """Where the maps lie."""
         return self.path / "maps"

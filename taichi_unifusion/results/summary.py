@@ -36,7 +36,11 @@ def summarize(record: RunRecord, files: Sequence[str], directory: Path) -> str:
         ]
         for name, size in record.maps.items()
     ]
-    lines = [*tracking_lines(record.tracking), f"frames   {count_frames(frames)}"]
+    lines = [
+        *tracking_lines(record.tracking),
+        *color_lines(record),
+        f"frames   {count_frames(frames)}",
+    ]
     lines += [
         f"           {entry.frames} {entry.reason} (first: {entry.first})"
         for entry in frames.reasons
@@ -68,6 +72,12 @@ def describe_up(record: RunRecord) -> str:
     """Which way is up, and how that was found."""
     direction = " ".join(f"{number:.2f}" for number in (record.T_up_world or ((),) * 3)[2][:3])
     return f"{direction} ({HOW.get(record.up, record.up)})"
+
+
+def color_lines(record: RunRecord) -> list[str]:
+    """Which colour camera images were registered with, where that is not plain."""
+    color = record.recording.color if record.recording else None
+    return [f"colour   {color.verdict}"] if color and color.camera else []
 
 
 def tracking_lines(tracking: Mapping[str, Any] | None) -> list[str]:

@@ -15,6 +15,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ..config import dump_config
+from ..datasets.color_camera import ColorCamera, write_color_camera
 from ..errors import InputError
 from ..files.atomic import check_writable, write_text
 from ..files.images import write_png
@@ -89,6 +90,7 @@ def write_results(
     _write_maps(writer, pipeline, run)
     writer.write(folder.trajectory, lambda path: write_trajectory(path, run.trajectory))
     writer.write(folder.config, lambda path: write_text(path, dump_config(pipeline.config)))
+    _write_color_camera(writer, recording)
     logger.info("extracting the mesh")
     extracting = time.perf_counter()
     mesh = writer.attempt(f"{folder.path}: the mesh could not be extracted", pipeline.extract_mesh)
@@ -145,6 +147,18 @@ def _write_maps(writer: FolderWriter, pipeline: Pipeline, run: RunResult) -> Non
                     f"{reason})"
                 )
             )
+
+
+def _write_color_camera(writer: FolderWriter, recording: Source | None) -> None:
+    """Write the colour camera that was used, for `--color-camera`; without one remove an earlier
+    run's.
+    """
+    color = recording.color if recording else None
+    if color is None or color.camera is None:
+        writer.remove(writer.folder.color_camera)
+        return
+    camera = ColorCamera.from_values(color.camera, "the colour camera of this run")
+    writer.write(writer.folder.color_camera, lambda path: write_color_camera(path, camera))
 
 
 def _first_lacking(run: RunResult) -> dict[str, str]:

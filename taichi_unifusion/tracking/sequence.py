@@ -9,6 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..datasets import Dataset, DatasetView
 from ..datasets.loading import index_in_recording, load_ahead
@@ -17,6 +21,9 @@ from ..files.atomic import write_text
 from ..types import Frame
 from .base import Tracker, TrackingResult, Verdict
 from .external import runs
+
+if TYPE_CHECKING:
+    from ..datasets import ColorCamera
 
 logger = logging.getLogger(__name__)
 
@@ -109,6 +116,17 @@ class PosedFrames(DatasetView):
         if tracked.T_world_camera is None:
             raise PoseError(f"{frame.label}: {tracked.verdict}, {tracked.message}")
         return replace(frame, T_world_camera=tracked.T_world_camera)
+
+    def pose_at(self, index: int) -> tuple[float | None, NDArray[np.float64] | None]:
+        return super().pose_at(index)[0], self.tracking.frames[index].T_world_camera
+
+    def with_color_camera(
+        self, camera: ColorCamera | None, velocities: NDArray[np.float64] | None = None
+    ) -> PosedFrames:
+        """As for every data set; the velocities are those of the poses found."""
+        return super().with_color_camera(
+            camera, self.velocities() if velocities is None else velocities
+        )
 
 
 def write_tracking(path: Path, result: TrackingResult) -> None:
