@@ -140,6 +140,8 @@ def report(table: Table, found: Mapping[str, ByExperiment]) -> str:
 
 
 def _counted(what: str, results: Results) -> str:
+    if results.kept:
+        return f"{what}: {len(results.done)} scenes, done before"
     total = len(results.done) + len(results.failed) + len(results.missing)
     text = f"{what}: {len(results.done)} of {total} scenes"
     if results.missing:

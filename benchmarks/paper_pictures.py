@@ -35,7 +35,7 @@ class Panel:
         for value in np.linspace(0, top, TICKS + 1):
             _, y = self.at(0, value)
             cv2.line(self.image, (LEFT, y), (WIDTH - RIGHT, y), GRID, 1)
-            self._text(f"{value:.3g}", 8, y + 5, 0.42)
+            self._text(f"{value:.4g}", 8, y + 5, 0.42)
 
     def at(self, x: float, value: float) -> tuple[int, int]:
         """The pixel of a place."""

@@ -38,6 +38,7 @@ class Results:
     done: dict[str, dict[str, Any]] = field(default_factory=dict)  # name -> numbers
     failed: dict[str, str] = field(default_factory=dict)  # name -> why
     missing: tuple[str, ...] = ()  # on the list but not in the root
+    kept: bool = False  # of earlier calls alone: how many there should be is not known
 
 
 def run_scenes(
@@ -74,7 +75,7 @@ def run_scenes(
 
 def read_results(out: Path) -> Results:
     """What earlier calls left in an experiment's folder under a method, whatever their settings."""
-    results = Results()
+    results = Results(kept=True)
     for file in sorted(out.glob("*.json")):
         values = json.loads(file.read_text())
         results.done[values["scene"]] = values["numbers"]

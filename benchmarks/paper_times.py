@@ -12,6 +12,7 @@ import numpy as np
 from gpu_checks import CHANNELS, RandomFeatures, all_together, timed, with_infrared
 
 import taichi_unifusion as uf
+from taichi_unifusion.errors import InputError
 from taichi_unifusion.maps import BaseMap, FeatureMap
 from taichi_unifusion.tracking import make_tracker
 
@@ -28,6 +29,11 @@ def milliseconds(
     """
     live = uf.init(device)
     taken = [with_properties(frame) for frame in _frames(recording, frames, size)]
+    if len(taken) <= WARM:
+        raise InputError(
+            f"times: {recording or 'the room'} gives {len(taken)} frames, more than {WARM} are "
+            "needed: the first ones compile"
+        )
     ms = by_map(taken)
     ms["internal tracking"] = _tracking(taken)
     ms["all at once"] = all_together(taken)

@@ -210,7 +210,9 @@ def test_classes_of_scannet_and_s3dis(tmp_path, here, mini, capsys):
     assert rows_of(capsys.readouterr().out, "mini")[0][3:] == ["-"] * 3
     arguments = [*features, *mini, "--text", f"embeddings:{texts['s3dis']}"]
     assert paper.main(["V", str(stanford), "--keep-maps", *arguments]) == 0
-    row = list(map(str, rows_of(capsys.readouterr().out, "mini")[0]))
+    text = capsys.readouterr().out
+    row = rows_of(text, "mini")[0]
+    assert "scannet-classes: 1 scenes, done before" in text
     assert all(float(share) > 60 for share in row)  # that of ScanNet was kept
     assert (tmp_path / "out" / "s3dis-classes" / "mini" / "area_1-office_1" / "maps").is_dir()
 
@@ -330,6 +332,8 @@ def test_times_have_the_paper_s_columns(tmp_path, monkeypatch, capsys):
     assert len([cell for cell in ours.strip("|").split("|")[1:] if float(cell) > 0]) == 7
     found = json.loads((tmp_path / "table_VIII.json").read_text())
     assert found["size"] == [160, 120] and found["frames"] == 2
+    with pytest.raises(SystemExit, match="gives 2 frames, more than 2 are needed"):
+        paper.main([*arguments, "--frames", "2"])
 
 
 def test_figures_are_the_ablations(tmp_path, monkeypatch):
