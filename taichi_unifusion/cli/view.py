@@ -6,23 +6,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ..errors import InputError
+from .interrupts import stop_on_signal
 from .options import OPTIONAL, EncoderOptions
 from .results_source import results_source
 from .terminal import DONE
 from .viewing import PageOptions, open_page
 
 if TYPE_CHECKING:
+    from ..viewer.answers import ShownAnswer
     from ..viewer.scene import Scene
     from ..viewer.source import ResultsSource
 
 
 @dataclass(frozen=True)
 class View:
-    """Show results on a page in the browser: every layer, questions, points, distances, parts,
-    cameras.
+    """Show results on a page in the browser, or in a window: every layer, questions, points,
+    distances, parts, cameras.
 
     Example: unifusion view results/kitchen
 
@@ -40,6 +42,13 @@ class View:
     """A mesh in the same world: its distance to each result becomes a layer."""
     cameras: Annotated[int, arg(metavar="N")] = 60
     """At most so many cameras are drawn, evenly over the trajectory."""
+    window: FlagCreatePairsOff[bool] = False
+    """Show a window on the screen instead of a page in the browser."""
+    query: Annotated[
+        UseAppendAction[tuple[str, ...]],
+        arg(metavar="TEXT", help_behavior_hint="(with --window; give it once for each)"),
+    ] = ()
+    """What to look for; more can be typed in the terminal. The page has a box to type in."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
     encoder: Annotated[EncoderOptions, arg(name="")] = field(default_factory=EncoderOptions)
 
@@ -55,6 +64,10 @@ def view(options: View) -> int:
     sources = [results_source(path, shown, options.encoder) for path in options.dirs]
     scene = _scene_of(sources, options.overlay)
     runtime.init(options.encoder.device)
+    if options.window:
+        return _show_window(scene, sources, options.query)
+    if options.query:
+        raise InputError("query: is for --window; the page has a box to type in")
     viewer = open_page(options.page, scene.name)
     try:
         from ..viewer.web_panels import ResultsPage
@@ -63,6 +76,31 @@ def view(options: View) -> int:
         viewer.serve()
     finally:
         viewer.close()
+    return DONE
+
+
+def _show_window(scene: Scene, sources: list[ResultsSource], texts: tuple[str, ...]) -> int:
+    """Results in a window, until it is closed or Ctrl-C."""
+    from ..viewer.window import SceneWindow
+
+    window = SceneWindow(scene.name)
+    asked = next((source for source in sources if source.has_features), None)
+
+    def ask(text: str) -> ShownAnswer:
+        if asked is None:
+            raise InputError(f"{scene.name}: there are no features to ask, or no text encoder")
+        return asked.ask(scene.meshes[sources.index(asked)], text)
+
+    try:
+        window.put(scene)
+        for text in texts:
+            found = ask(text)
+            print("\n".join([found.sentence, *found.rows]), flush=True)
+            window.answer(found)
+        with stop_on_signal(clean_up=lambda: None) as stop:
+            window.serve(ask if asked is not None else None, stop)
+    finally:
+        window.close()
     return DONE
 
 

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
+from ..errors import InputError, MissingDependency
+
 if TYPE_CHECKING:
     from ..viewer.null import Watcher
     from ..viewer.web import WebViewer
+
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,9 @@ class WatchOptions:
     view: FlagCreatePairsOff[bool] = False
     """Show the map on a page in the browser while it grows; the page stays until Ctrl-C."""
     page: Annotated[PageOptions, arg(name="view")] = field(default_factory=PageOptions)
+    # not --window, which is the setting of how many frames are fused at once
+    view_window: FlagCreatePairsOff[bool] = False
+    """Show the map in a window while it grows; where there is no screen the run goes on without."""
 
 
 def open_page(options: PageOptions, title: str) -> WebViewer:
@@ -49,6 +58,10 @@ def open_watcher(
     options: WatchOptions, title: str, frames: int, stop: Callable[[], bool]
 ) -> Watcher:
     """What watches a run of so many frames, which ends early when `stop` says so."""
+    if options.view and options.view_window:
+        raise InputError("view and view-window: choose one of them")
+    if options.view_window:
+        return _open_window(title, frames, stop)
     if not options.view:
         from ..viewer.null import NullViewer
 
@@ -57,3 +70,17 @@ def open_watcher(
     from ..viewer.web_live import WebLive
 
     return WebLive(viewer, frames, stop)
+
+
+def _open_window(title: str, frames: int, stop: Callable[[], bool]) -> Watcher:
+    """A window that watches a run; where there can be none, nothing does, and that is said."""
+    from ..viewer.null import NullViewer
+
+    try:
+        from ..viewer.window import SceneWindow
+        from ..viewer.window_live import WindowLive
+
+        return WindowLive(SceneWindow(title), frames, stop)
+    except MissingDependency as error:
+        logger.warning("%s; the run goes on without it", error)
+        return NullViewer()

@@ -19,6 +19,8 @@ from ..types import Frame, Mesh
 INTERVAL = 1.0  # [s] between two updates
 SHARE = 0.12  # of the time of a run that watching may take
 RESOLUTION = 2  # cells a voxel of what is shown while it grows
+BACK, ABOVE = 0.8, 0.5  # [m] from where one looks at first, behind and above the camera
+LEVEL = np.cos(np.radians(40))  # of the camera's up to an axis of the world, which then is up
 FIRST_BLOCKS = 12  # of the first update, before one is known to take how long
 
 Block = tuple[int, int, int]
@@ -78,6 +80,13 @@ class ChangedChunks:
             del self.waiting[block]
         mesh = pipeline.extract_mesh(self.resolution, blocks=chosen, flush=False)
         return split_blocks(mesh, chosen, pipeline.surface.voxel_size)
+
+
+def upright(up: NDArray) -> NDArray[np.float64]:
+    """The axis of the world that is nearest to a camera's up, if any is near."""
+    axis = np.abs(up).argmax()
+    level = np.sign(up[axis]) * np.eye(3)[axis]
+    return level if float(up @ level) > LEVEL else up
 
 
 def split_blocks(mesh: Mesh, blocks: NDArray[np.int32], voxel_size: float) -> Mapping[Block, Mesh]:

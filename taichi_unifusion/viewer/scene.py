@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..geometry.triangles import vertex_normals
+from ..geometry.triangles import area_vectors, vertex_normals
 from ..rendering.look import Look, color_table, colorize, shown_range
 from ..types import Mesh, PinholeCamera, check_rigid
 
 UNKNOWN = (120, 120, 125)  # RGB of a vertex that has no value
 OUTLIERS = 0.5  # percent of the vertices at either end that do not count for the size of a scene
+AZIMUTHS, LOOKED_AT = 24, 50_000  # sides that an overview may be from; triangles that choose it
 APART = 0.15  # of the width of a result: the gap to the next one beside it
 
 
@@ -268,12 +269,21 @@ class Scene:
         return np.asarray(points, np.float64) @ self.T_up_world[2, :3] + self.T_up_world[2, 3]
 
     def overview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where to look from, (3,) [m], and at what, to see everything from above and aside."""
+        """Where to look from, (3,) [m], and at what, to see everything from above, and from the side
+        that most of the surface faces: of a corner of a room not the backs of its walls.
+        """
         low, high = self.bounds()
         center, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
         side = np.cross(self.up, np.eye(3)[np.abs(self.up).argmin()])
         side /= np.linalg.norm(side)
-        towards = 0.62 * side + 0.42 * np.cross(self.up, side) + 0.66 * self.up
+        angles = np.arange(AZIMUTHS)[:, None] * (2 * np.pi / AZIMUTHS) + 0.6
+        level = np.cos(angles) * side + np.sin(angles) * np.cross(self.up, side)
+        ways = 0.75 * level + 0.66 * self.up
+        towards = ways[0]
+        for part in self.meshes[:1]:  # one decides: others stand beside it as it is seen
+            faces = part.mesh.faces[:: max(1, len(part.mesh.faces) // LOOKED_AT)]
+            shown = np.maximum(area_vectors(part.mesh.vertices, faces) @ ways.T, 0).sum(axis=0)
+            towards = ways[int(shown.argmax())]
         return center + 2.1 * max(radius, 0.1) * towards / np.linalg.norm(towards), center
 
 

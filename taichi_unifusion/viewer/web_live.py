@@ -17,7 +17,7 @@ from ..errors import UniFusionError
 from ..pipeline import Pipeline
 from ..run_log import SkippedFrame, StepResult
 from ..types import Frame, Mesh
-from .live import Block, ChangedChunks, Pace
+from .live import ABOVE, BACK, Block, ChangedChunks, Pace, upright
 from .scene import Layer
 from .source import ResultsSource
 from .web import WAIT, WebViewer, fly
@@ -29,8 +29,6 @@ from .web_text import paragraph, table
 logger = logging.getLogger(__name__)
 
 IMAGE_WIDTH = 240  # [pixels] of what the camera sees
-BACK, ABOVE = 0.8, 0.5  # [m] from where the page looks at first, behind and above the camera
-LEVEL = np.cos(np.radians(40))  # of the camera's up to an axis of the world, which then is up
 GREY = 190  # of a surface without colour
 
 
@@ -187,10 +185,3 @@ def small_image(frame: Frame) -> np.ndarray | None:
     return np.asarray(
         cv2.resize(frame.color, (IMAGE_WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8
     )
-
-
-def upright(up: np.ndarray) -> np.ndarray:
-    """The axis of the world that is nearest to a camera's up, if any is near."""
-    axis = np.abs(up).argmax()
-    level = np.sign(up[axis]) * np.eye(3)[axis]
-    return level if float(up @ level) > LEVEL else up
