@@ -48,6 +48,7 @@ COLUMNS = {  # title -> (where in a row's numbers, format)
     "map MB": ("map_mb", ".1f"),
     "of it surface": ("surface_mb", ".1f"),
     "lean MB": ("lean_mb", ".1f"),
+    "of it surface ": ("lean_surface_mb", ".1f"),
     "ms a frame": ("cpu_ms", ".0f"),
 }
 
@@ -62,6 +63,7 @@ def measure(
         "surface_mb": reconstruction.surface_mb,
         "color_mb": reconstruction.color_mb,
         "lean_mb": reconstruction.lean_mb,
+        "lean_surface_mb": reconstruction.lean_surface_mb,
         "cpu_ms": reconstruction.cpu_ms,
         "wall_ms": reconstruction.wall_ms,
         "mesh_s": reconstruction.mesh_s,

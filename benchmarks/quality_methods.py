@@ -22,9 +22,11 @@ from taichi_unifusion.types import Frame, Mesh
 
 PAPER = Path(__file__).resolve().parents[1] / "configs" / "paper.yaml"
 TRUNCATION, MIN_WEIGHT = 6.0, 1.0  # of the TSDF: in voxels, and frames that must have seen a voxel
-BLOCK = 16  # voxels along a TSDF block (Open3D's default)
+BLOCK = 8  # voxels along a TSDF block: the smallest that VoxelBlockGrid can be made, at some loss of speed
+# Open3D's pixel u spans [u, u + 1), ours is centred at u: what it is given as the principal point
+HALF_PIXEL = 0.5
 TSDF_BYTES = {"tsdf": 4, "weight": 4, "color": 12}  # a voxel, as float32
-LEAN_BLOCK, LEAN_BYTES = 8, 4 + 2 + 6  # the smallest that VoxelBlockGrid can be made, at some loss
+LEAN_BYTES = {"surface": 4 + 2, "color": 6}  # a voxel, with 16-bit weights and colours
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ class Reconstruction:
     color: Callable[[NDArray], NDArray] | None
     surface_mb: float  # of the map
     color_mb: float
-    lean_mb: float  # both, as small as the method can store them
+    lean_mb: float  # both, as small as the method can store them...
+    lean_surface_mb: float  # ...and of that the surface
     cpu_ms: float  # of all threads, a frame: median
     wall_ms: float  # a frame: median
     mesh_s: float  # wall time of the extraction
@@ -81,6 +84,7 @@ def ours(config: Config, frames: Sequence[Frame]) -> Reconstruction:
         surface,
         color,
         surface + color,
+        surface,
         *watch.median(),
         mesh_s,
         asdict(config),
@@ -102,9 +106,11 @@ def tsdf(
 
     cpu, far = Device("CPU:0"), DEPTH_RANGE[1]
     grid = o3d.t.geometry.VoxelBlockGrid(
-        tuple(TSDF_BYTES), (float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, 8_000, cpu
+        tuple(TSDF_BYTES), (float32,) * 3, ((1,), (1,), (3,)), voxel_size, BLOCK, 64_000, cpu
     )
-    K, watch = Tensor(frames[0].camera.matrix), Stopwatch([])
+    matrix = frames[0].camera.matrix.copy()
+    matrix[:2, 2] += HALF_PIXEL
+    K, watch = Tensor(matrix), Stopwatch([])
     for frame in frames:
         depth = o3d.t.geometry.Image(
             Tensor(np.where(frame.depth < DEPTH_RANGE[0], 0, frame.depth).astype(np.float32))
@@ -124,17 +130,15 @@ def tsdf(
         attributes={"color": extracted.vertex.colors.numpy()},
     )
     mesh_s = time.perf_counter() - start
-    voxels = grid.hashmap().size() * BLOCK**3
-    surface, color = (
-        voxels * (TSDF_BYTES["tsdf"] + TSDF_BYTES["weight"]) / 2**20,
-        voxels * TSDF_BYTES["color"] / 2**20,
-    )
+    voxels = grid.hashmap().size() * BLOCK**3 / 2**20
+    surface = voxels * (TSDF_BYTES["tsdf"] + TSDF_BYTES["weight"])
     return Reconstruction(
         mesh,
         None,
         surface,
-        color,
-        _lean_mb(grid),
+        voxels * TSDF_BYTES["color"],
+        voxels * sum(LEAN_BYTES.values()),
+        voxels * LEAN_BYTES["surface"],
         *watch.median(),
         mesh_s,
         {
@@ -146,26 +150,19 @@ def tsdf(
     )
 
 
-def _lean_mb(grid) -> float:
-    """Megabytes in blocks of 8^3 voxels that were touched, with 16-bit weight and colour."""
-    rows = grid.hashmap().active_buf_indices().numpy()
-    weight = grid.attribute("weight").numpy()[rows, ..., 0]  # (B, 16, 16, 16)
-    cells = BLOCK // LEAN_BLOCK
-    parts = weight.reshape(len(rows), cells, LEAN_BLOCK, cells, LEAN_BLOCK, cells, LEAN_BLOCK)
-    return int((parts.max(axis=(2, 4, 6)) > 0).sum()) * LEAN_BLOCK**3 * LEAN_BYTES / 2**20
-
-
 def _finer() -> Config:
     config = Config()
-    return replace(config, surface=replace(config.surface, voxel_size=0.025))
+    return replace(config, surface=replace(config.surface, voxel_size=0.04))
 
 
 METHODS: dict[str, Callable[[Sequence[Frame]], Reconstruction]] = {
     "ours": lambda frames: ours(Config(), frames),
-    "ours-2.5cm": lambda frames: ours(_finer(), frames),
+    "ours-4cm": lambda frames: ours(_finer(), frames),
     "paper": lambda frames: ours(load_config(PAPER), frames),
     "tsdf-1cm": partial(tsdf, voxel_size=0.01),
     "tsdf-2cm": partial(tsdf, voxel_size=0.02),
+    "tsdf-0.5cm": partial(tsdf, voxel_size=0.005),
+    "tsdf-0.3cm": partial(tsdf, voxel_size=0.003),
 }
 
 

@@ -14,6 +14,7 @@ from house import load_house
 
 from taichi_unifusion.datasets import Dataset, open_dataset
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
+from taichi_unifusion.tracking import track
 from taichi_unifusion.types import Frame, Mesh
 
 DEPTH_RANGE = (0.4, 5.0)  # [m] readings that are fused, and compared with
@@ -61,10 +62,13 @@ def synthetic(data: Path, frames: int | None) -> Scene:
     )
 
 
-def kitchen(data: Path, frames: int | None) -> Scene:
-    """7-Scenes RedKitchen 0-299: every 10th is fused, the 5th in between compared with."""
+def kitchen(data: Path, frames: int | None, *, tracked: bool = False) -> Scene:
+    """7-Scenes RedKitchen 0-299: every 10th is fused, the 5th in between compared with. At the given
+    poses, or at those of our tracker, which fit this recording better.
+    """
     recording = open_dataset("7scenes", data / "7scenes-redkitchen")[:300]
-    return _of_recording("kitchen", recording, recording, frames or 30, None, held_out=30)
+    recording, name = (track(recording), "kitchen-tracked") if tracked else (recording, "kitchen")
+    return _of_recording(name, recording, recording, frames or 30, None, held_out=30)
 
 
 def house(path: str, data: Path, frames: int | None) -> Scene:
@@ -94,6 +98,7 @@ def _of_recording(
 SCENES: dict[str, Callable[[Path, int | None], Scene]] = {
     "synthetic": synthetic,
     "kitchen": kitchen,
+    "kitchen-tracked": partial(kitchen, tracked=True),
     "house-living": partial(house, "living"),
     "house-bedroom": partial(house, "bedroom"),
     "house-tour": partial(house, "tour"),
