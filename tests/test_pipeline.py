@@ -231,11 +231,11 @@ def test_a_pose_beyond_the_index_range_is_skipped(fused, frames):
     far = replace(frames[0], T_world_camera=T_world_camera)
     with pytest.raises(OutOfRange):
         pipeline.step(far)
+    assert len(pipeline.surface) == before
     result = pipeline.run([far, frames[1]])
     assert [frame.reason for frame in result.skipped] == ["outside the range of the map"] and len(
         result.steps
     ) == 1
-    assert len(pipeline.surface) == before
 
 
 def test_F7_every_kind_of_trouble_is_warned_of_once(pipeline, frames, caplog):

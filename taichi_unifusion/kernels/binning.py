@@ -150,7 +150,7 @@ def bin_surfel_samples(
     keys: Ints2,  # (B, 5) SAMPLE_FRAMES |= POINT_FRAMES of the blocks whose samples these are
     sums: Sums3,  # (B, 64, 7) counts, normals, positions; read, then 0
     # (B, 64, 2 [+ 3]) += points behind the sample, their signed distance to the surfel's plane
-    # [voxels], and its normal
+    # [voxels], and, of samples on the surface, its normal
     sample_sums: Sums3,
 ):
     # cells, not blocks: enough of them to share out evenly
@@ -173,9 +173,10 @@ def bin_surfel_samples(
                         ti.cast(ti.round(distance * FIXED), ti.i64) * count,
                     )
                     if ti.static(with_normals):
-                        for d in ti.static(range(3)):
-                            along = ti.cast(ti.round(normal[d] * FIXED), ti.i64)
-                            ti.atomic_add(sample_sums[at, target, 2 + d], along * count)
+                        if offsets[s] == 0:  # beside the surface, the distance says as much
+                            for d in ti.static(range(3)):
+                                along = ti.cast(ti.round(normal[d] * FIXED), ti.i64)
+                                ti.atomic_add(sample_sums[at, target, 2 + d], along * count)
                     frames = keys[b, POINT_FRAMES]
                     if keys[at, SAMPLE_FRAMES] & frames != frames:
                         ti.atomic_or(keys[at, SAMPLE_FRAMES], frames)

@@ -19,7 +19,8 @@ class Layout:
     centered: bool = (
         False  # regress about the mean of the targets, which is one more row of a latent
     )
-    derivatives: bool = False  # samples carry normals too (Eq. 16)
+    derivatives: bool = False  # samples carry normals too (Eq. 16)...
+    some_normals: bool = False  # ...but only those on the surface
     information: bool = False  # keep sums and solve when fusing, instead of fusing latents (Eq. 19)
 
     @property

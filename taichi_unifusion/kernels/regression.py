@@ -18,6 +18,7 @@ from .gram import flush, keep_sums, solve_voxel
 from .index import INDEX_HALF, block_in, in_range
 from .tasks import worker_stride
 
+LEAST_SHARE = 1e-3  # of a cell's points that have a normal, below which it is left out
 TILE = 128  # samples whose features are held at once: the products run over this contiguous axis
 
 
@@ -91,11 +92,17 @@ def add_cell(
         tiles[worker, size + channels, column] = root
     column += 1
     if ti.static(layout.derivatives):
-        for axis in ti.static(range(3)):  # Eq. 16: one more row an axis, its target the normal
-            for a in ti.static(range(size)):
-                tiles[worker, a, column] = features[at, 1 + axis, a] * root
-            tiles[worker, size, column] = cells[n, 2 + axis]
-            column += 1
+        normal = ti.Vector([cells[n, 2], cells[n, 3], cells[n, 4]])
+        share = 1.0  # of the cell's points, those that have a normal and agree on it
+        if ti.static(layout.some_normals):
+            share = normal.norm() / root
+        if share > LEAST_SHARE:
+            scale = ti.sqrt(share)
+            for axis in ti.static(range(3)):  # Eq. 16: one more row an axis, its target the normal
+                for a in ti.static(range(size)):
+                    tiles[worker, a, column] = features[at, 1 + axis, a] * (root * scale)
+                tiles[worker, size, column] = normal[axis] / scale
+                column += 1
     return column
 
 
@@ -238,7 +245,8 @@ def encode_points(
                                 tiles[worker, size + channels, filled] = 1.0
                             filled += 1
                             if ti.static(layout.derivatives):
-                                for axis in range(3):
+                                normal = ti.Vector([targets[n, 1], targets[n, 2], targets[n, 3]])
+                                for axis in range(3 if normal.norm() > LEAST_SHARE else 0):
                                     g = position_gradient(t, axis, rank, anchors, projection, scale)
                                     for a in ti.static(range(rank)):
                                         # d/dx = 1/2 d/dt

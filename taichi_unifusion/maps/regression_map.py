@@ -105,6 +105,7 @@ class RegressionMap(BaseMap[S]):
         *,
         centered: bool,
         derivatives: bool = False,
+        some_normals: bool = False,
         fields: Sequence[VoxelField] = (),
     ) -> None:
         self.layout = Layout(
@@ -112,6 +113,7 @@ class RegressionMap(BaseMap[S]):
             channels,
             centered,
             derivatives,
+            some_normals,
             settings.fusion == "information",
         )
         self.grid: RegressionGrid = RegressionGrid(self.layout, settings.noise, fields)

@@ -59,17 +59,17 @@ class MapSettings:
 class SurfaceSettings(MapSettings):
     """Settings of the surface map (Sec. IV-B)."""
 
-    gpis: Literal["samples", "derivatives"] = "samples"
+    gpis: Literal["samples", "derivatives", "both"] = "both"
     """samples: points on and beside the surface carry signed distances; derivatives: points carry
-    their normals (Eq. 14-17).
+    their normals (Eq. 14-17); both: points on the surface carry both, those beside it distances.
     """
-    sample_distance: float = 0.3
+    sample_distance: float = 0.2
     """Distance of the off-surface samples along the normal, in voxels (d_s)."""
     support_points: int = 4
     """Surface is extracted only in cells (quarters of a voxel) that held this many samples of one
     frame (fewer where a whole voxel has few); 0: everywhere in voxels that held any."""
 
-    support_closing: int = 14
+    support_closing: int = 10
     """Cells with at least this many of their 26 neighbours seen count as seen, which closes
     pinholes; 27: none, 1: a rim all around."""
     carve: bool = True
@@ -93,7 +93,7 @@ class SurfaceSettings(MapSettings):
             )
         if not -127 <= self.min_evidence <= 127:
             raise InputError(f"min_evidence: must lie in -127..127 frames, got {self.min_evidence}")
-        check_choice("gpis", self.gpis, ("samples", "derivatives"))
+        check_choice("gpis", self.gpis, ("samples", "derivatives", "both"))
 
 
 @dataclass(frozen=True)

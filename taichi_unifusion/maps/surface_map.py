@@ -43,17 +43,18 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
 
     def __init__(self, settings: SurfaceSettings | None = None, **overrides: Any) -> None:
         settings = dataclasses.replace(settings or SurfaceSettings(), **overrides)
-        derivatives = settings.gpis == "derivatives"
+        derivatives = settings.gpis != "samples"
         super().__init__(
             "surface",
             1,
             settings,
             centered=False,
             derivatives=derivatives,
+            some_normals=settings.gpis == "both",
             fields=[EVIDENCE] * settings.carve,
         )
         beside = settings.sample_distance
-        steps = (0.0,) if derivatives else (-beside, 0.0, beside)
+        steps = (0.0,) if settings.gpis == "derivatives" else (-beside, 0.0, beside)
         self.steps = np.array(steps, np.float32)  # of samples along a normal [voxels]
         self.binner = SurfelBinner(
             self.grid,
@@ -91,13 +92,13 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         self, points: NDArray[np.float32], normals: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Samples at every point and beside it, as published, and their targets: x + a n -> a,
-        x - a n -> -a, in voxels; with derivatives also the normals.
+        x - a n -> -a, in voxels; with derivatives also the normals, 0 beside the surface.
         """
         count = len(self.steps)
         steps = np.repeat(self.steps, len(points))[:, None]
         repeated = np.tile(normals, (count, 1))
         samples = np.tile(points, (count, 1)) + steps * np.float32(self.voxel_size) * repeated
-        targets = np.hstack([steps, repeated]) if self.layout.derivatives else steps
+        targets = np.hstack([steps, repeated * (steps == 0)]) if self.layout.derivatives else steps
         return samples.astype(np.float32, copy=False), targets
 
     def learn_visibility(self, cloud: PointCloud, local: LocalLim, sign: int) -> None:

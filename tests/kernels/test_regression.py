@@ -50,8 +50,10 @@ def property_twin(target: PropertyMap, *clouds) -> dict:
         ("cells", "samples", 1),
         ("cells", "samples", 2),
         ("cells", "derivatives", 1),
+        ("cells", "both", 1),
         ("points", "samples", 1),
         ("points", "derivatives", 1),
+        ("points", "both", 1),
     ],
 )
 def test_surface_regression_equals_the_oracle(sampling, gpis, margin):
@@ -119,7 +121,7 @@ def side_by_side(clouds, settings):
     return np.vstack([in_voxels(cloud, settings) for cloud in clouds]), frames
 
 
-@pytest.mark.parametrize("gpis", ["samples", "derivatives"])
+@pytest.mark.parametrize("gpis", ["samples", "derivatives", "both"])
 def test_a_surface_window_equals_the_oracle(gpis):
     """Noise is a frame's: three frames in one regression have three times that of one, in every
     voxel that all of them saw.

@@ -149,7 +149,8 @@ def test_fuse_with_sign_minus_one_undoes_it():
 
 
 @pytest.mark.parametrize(
-    ("sampling", "gpis"), [("cells", "samples"), ("cells", "derivatives"), ("points", "samples")]
+    ("sampling", "gpis"),
+    [("cells", "samples"), ("cells", "derivatives"), ("cells", "both"), ("points", "samples")],
 )
 def test_information_fusion_is_one_regression_over_all_frames(sampling, gpis):
     """Surface: every voxel's F from the samples of all frames that encode it."""

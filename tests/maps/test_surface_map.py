@@ -161,10 +161,13 @@ def test_every_resolution_gives_the_same_closed_surface(scene, resolution):
     "settings",
     [
         {"gpis": "derivatives"},
+        {"sample_distance": 0.1},
         {"sampling": "points"},
         {"sampling": "points", "gpis": "derivatives"},
         {"margin": 2},
-        {"noise": 0.1, "margin": 2},
+        {"gpis": "samples"},
+        {"gpis": "samples", "noise": 0.1, "margin": 2},
+        {"noise": 0.3, "margin": 2},
     ],
     ids=lambda settings: "-".join(f"{v}" for v in settings.values()),
 )

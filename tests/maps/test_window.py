@@ -104,7 +104,7 @@ def test_another_process_with_one_thread_writes_the_same_bytes_and_goes_on_from_
 # ---- Against single frames ----
 
 
-@pytest.mark.parametrize("gpis", ["samples", "derivatives"])
+@pytest.mark.parametrize("gpis", ["samples", "derivatives", "both"])
 def test_a_window_of_one_frame_is_integrating_its_cloud(gpis):
     frames = [seen_from(turned(n), n) for n in range(3)]
     config = replace(SINGLE, surface=replace(SINGLE.surface, gpis=gpis))

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 CELLS = 4  # support and averaging cells per voxel edge
+LEAST_SHARE = 1e-3  # of normals that count
 UNKNOWN = 1e9  # signed distance where no voxel reaches
 CORNERS = np.array(list(product((0, 1), repeat=3)))
 # corners around each face
@@ -133,16 +134,32 @@ def encode_voxel(encoder, t, counts, targets, normals, noise, centered):
     """
     P, W, Y = encoder(t), counts, targets
     mean = (W @ Y / W.sum())[None] if centered else np.zeros((1, Y.shape[1]))
-    Y = Y - mean
-    if normals is not None:
-        gradient = 0.5 * encoder.gradient(t)  # by voxel units, as t moves by half a voxel a voxel
-        P, W, Y = (
-            np.vstack([P, *np.moveaxis(gradient, 1, 0)]),
-            np.tile(W, 4),
-            np.vstack([Y, *normals.T[:, :, None]]),
-        )
+    P, W, Y = with_slopes(encoder, t, P, W, Y - mean, normals)
     F = regress(P, W, Y, noise)
     return np.vstack([F, mean]) if centered else F
+
+
+def with_slopes(encoder, t, P, W, Y, normals):
+    """The rows of a regression, and those of the slopes at the same points (Eq. 16): `normals`
+    (N, 3), or (N, 4) with the share of each weight that they count for; None: there are none.
+    """
+    if normals is None:
+        return P, W, Y
+    gradient = 0.5 * encoder.gradient(t)  # by voxel units, as t moves by half a voxel a voxel
+    share = normals[:, 3] if normals.shape[1] == 4 else np.ones(len(normals))
+    return (
+        np.vstack([P, *np.moveaxis(gradient, 1, 0)]),
+        np.concatenate([W, *[W * share] * 3]),
+        np.vstack([Y, *normals.T[:3, :, None]]),
+    )
+
+
+def shared_normals(means):
+    """Mean vectors (N, 3) of normals of which some are 0, as unit normals and their share (N, 4)."""
+    share = np.linalg.norm(means, axis=1, keepdims=True)
+    return np.hstack(
+        [means / np.where(share > LEAST_SHARE, share, 1), share * (share > LEAST_SHARE)]
+    )
 
 
 # ---- Voxels, cells, surfels ----
@@ -227,14 +244,14 @@ def surfel_sample_frames(x, normals, offsets, frames):
 
 def bin_surfel_samples(x, normals, offsets, counts=None):
     """Lattice cell -> (count, mean signed distance of its centre to the planes of the surfels that
-    sample it, mean normal).
+    sample it, mean normal, which only samples on the surface have).
     """
     sums = defaultdict(lambda: np.zeros(5))
     for count, point, normal in surfels(x, normals, counts):
         for a in offsets:
             cell = np.floor((point + a * normal) * CELLS).astype(int)
             distance = normal @ ((cell + 0.5) / CELLS - point)
-            sums[tuple(cell.tolist())] += count * np.array([1, distance, *normal])
+            sums[tuple(cell.tolist())] += count * np.array([1, distance, *normal * (a == 0)])
     return {cell: (s[0], s[1:2] / s[0], s[2:] / s[0]) for cell, s in sums.items()}
 
 
@@ -317,7 +334,9 @@ def encode_cells(
     """
     lattice = np.array(list(cells))
     counts = np.array([cell[0] for cell in cells.values()], float)
-    targets, normals = (np.array([cell[i] for cell in cells.values()], float) for i in (1, 2))
+    targets, slopes = (np.array([cell[i] for cell in cells.values()], float) for i in (1, 2))
+    if derivatives == "some":
+        slopes = shared_normals(slopes)
     local = {}
     for key, own in rows_by(lattice // CELLS).items():
         if counts[own].sum() >= minimum:
@@ -332,7 +351,7 @@ def encode_cells(
                     t,
                     counts[near],
                     targets[near],
-                    normals[near] if derivatives else None,
+                    slopes[near] if derivatives else None,
                     noise * len(seen),
                     centered,
                 ),
@@ -345,8 +364,9 @@ def surface_frame(encoder, x, normals, settings, encode=encode_voxel, frames=Non
     """Local surface LIM of a frame: sample-based (Sec. IV-B.2) or derivative-based (IV-B.1) GPIS;
     or of a window, where `frames` are the numbers of the points' frames.
     """
-    derivatives = settings.gpis == "derivatives"
-    steps = [0.0] if derivatives else [-settings.sample_distance, 0.0, settings.sample_distance]
+    derivatives = {"samples": False, "derivatives": True, "both": "some"}[settings.gpis]
+    beside = settings.sample_distance
+    steps = [0.0] if settings.gpis == "derivatives" else [-beside, 0.0, beside]
     options = {"noise": settings.noise, "minimum": settings.min_points, "encode": encode}
     if settings.sampling == "cells":
         cells = bin_surfel_samples(x, normals, steps)
@@ -359,7 +379,9 @@ def surface_frame(encoder, x, normals, settings, encode=encode_voxel, frames=Non
     else:
         samples = np.vstack([x + a * normals for a in steps])
         targets = np.repeat(steps, len(x))[:, None]
-        slopes = np.tile(normals, (len(steps), 1)) if derivatives else None
+        on_surface = np.repeat(np.equal(steps, 0), len(x))[:, None]
+        slopes = np.tile(normals, (len(steps), 1)) * on_surface if derivatives else None
+        slopes = shared_normals(slopes) if derivatives == "some" else slopes
         local = encode_points(encoder, samples, targets, normals=slopes, **options)
         counts = {
             cell: len(n) for cell, n in rows_by(np.floor(samples * CELLS).astype(int)).items()

@@ -30,14 +30,7 @@ class Sums:
 
 def samples_of_voxel(encoder, t, counts, targets, normals, noise, centered):
     """What `reference.encode_voxel` regresses over."""
-    P, W, Y = encoder(t), counts, targets
-    if normals is not None:
-        gradient = 0.5 * encoder.gradient(t)
-        P, W, Y = (
-            np.vstack([P, *np.moveaxis(gradient, 1, 0)]),
-            np.tile(W, 4),
-            np.vstack([Y, *normals.T[:, :, None]]),
-        )
+    P, W, Y = reference.with_slopes(encoder, t, encoder(t), counts, targets, normals)
     return Samples(P, W, Y, counts.sum(), centered)
 
 

@@ -23,6 +23,7 @@ from taichi_unifusion.maps.encoding import EncoderSettings, position_encoding
 
 FRAMES = (0, 2)  # of a loop of 60: most of what one sees, the other sees too
 SIZE = {"width": 320, "height": 240}
+SAMPLES = {"gpis": "samples", "sample_distance": 0.3, "support_closing": 14}
 
 
 def clouds() -> list[uf.PointCloud]:
@@ -42,15 +43,15 @@ def clouds() -> list[uf.PointCloud]:
 def maps(seen: list[uf.PointCloud]) -> dict[str, object]:
     """Every kind of map after both clouds; `removed` after the second was taken out again."""
     made = {
-        "surface": uf.SurfaceMap(),
-        "surface-derivatives": uf.SurfaceMap(gpis="derivatives"),
-        "surface-points": uf.SurfaceMap(sampling="points", voxel_size=0.1),
+        "surface": uf.SurfaceMap(**SAMPLES),
+        "surface-derivatives": uf.SurfaceMap(gpis="derivatives", support_closing=14),
+        "surface-points": uf.SurfaceMap(sampling="points", voxel_size=0.1, **SAMPLES),
         "color": uf.PropertyMap("color", 3),
         "color-information": uf.PropertyMap("color", 3, fusion="information", voxel_size=0.05),
         "color-points": uf.PropertyMap("color", 3, sampling="points", voxel_size=0.1),
         "color-published": uf.PropertyMap("color", 3, prior="zero", margin=2, voxel_size=0.1),
         "features": FeatureMap("features", 33),
-        "removed": uf.SurfaceMap(),
+        "removed": uf.SurfaceMap(**SAMPLES),
         "removed-information": uf.PropertyMap("color", 3, fusion="information", voxel_size=0.1),
     }
     for cloud in seen:
