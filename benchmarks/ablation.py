@@ -110,7 +110,7 @@ def encoding(scene: Scene, out: Path) -> None:
     """
     variants = {}
     for name, config in (("published", uf.load_config(PAPER)), ("ours", uf.Config())):
-        for gpis in ("samples", "derivatives"):
+        for gpis in ("samples", "derivatives", "both"):
             variants[f"{name}: {gpis}"] = replace(
                 config, surface=replace(config.surface, gpis=gpis)
             )

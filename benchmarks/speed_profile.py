@@ -115,7 +115,9 @@ def _encoding(of: Arguments) -> tuple[float, float]:
     seen = _cells(masks[neighbors] & _rows(of["window"], 27))  # (B, 27) cells
     solved = points >= of["minimum"]
     columns = np.where(neighbors >= 0, seen, 0).sum(axis=1)[solved].sum()
-    columns *= 4 if layout.derivatives else 1
+    if layout.derivatives:
+        normals = _rows(of["cells"], None)[:, 2:5] if layout.some_normals else np.ones((1, 3))
+        columns *= 1 + 3 * normals.any(axis=1).mean()  # three more for a sample with a normal
     size, rows = layout.size // 4, layout.rows // 4  # in patches of 4 x 4
     patches = sum(min(i + 1, size) for i in range(rows))
     solve = layout.size**3 / 3 + layout.size**2 * (layout.rows - layout.size + 2 * layout.channels)

@@ -238,7 +238,8 @@ def test_encoding_is_counted_as_what_every_voxel_sees(small_room):
         ours.step(small_room[0])
         ours.finish()
     assert {"make_patches", "compact_cells", "encode_cells", "vote_cells"} <= counted.keys()
-    assert all(moved > 0 for launches in counted.values() for moved, _ in launches)
+    # the first frame launches what fuses, for no voxel, so that it is compiled
+    assert all(sum(moved for moved, _ in launches) > 0 for launches in counted.values())
     # of one map: 20 + 4 rows, in patches of 4 x 4
     blocks, layout = 2, Layout(20, 1)
     of = {
