@@ -4,10 +4,12 @@ texture, next to decoding the colour map where their rays hit the full mesh.
     python benchmarks/textures.py house-living --data PATH       # PATH holds aws-small-house
     python benchmarks/textures.py house-living --data PATH --texels 3 5 8 --triangles 0.1 0.25 1
     python benchmarks/textures.py synthetic --frames 20
+    python benchmarks/textures.py house-living --data PATH --triangles 0.1 --picture docs/textures.jpg
 
 Colours are compared as `unifusion evaluate rendering` does (docs/evaluation.md), the texture as it
 comes out of its JPEG. The error is that of the simplified mesh against the full one. CPU seconds
-count every thread.
+count every thread. The picture shows a frame that was not fused, the texture, and vertex colours on the
+same triangles.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 import argparse
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -28,12 +30,15 @@ from rich.table import Table
 
 import taichi_unifusion as uf
 from taichi_unifusion.evaluation import evaluate_rendering
+from taichi_unifusion.evaluation.rendering import render_frame
 from taichi_unifusion.files.glb import write_glb
 from taichi_unifusion.files.texture import Texture
 from taichi_unifusion.rendering.baking import TexturedMesh, bake
+from taichi_unifusion.rendering.raycaster import RayCaster
 from taichi_unifusion.rendering.simplification import simplify, surface_error
 
 T = TypeVar("T")
+SHOWN = (480, 360)  # pixels of each picture
 COLUMNS = (
     "what",
     "triangles",
@@ -68,6 +73,15 @@ def as_shown(textured: TexturedMesh) -> Texture:
     return replace(textured.texture, image=np.ascontiguousarray(image))
 
 
+def draw(frame: uf.Frame, shown: Sequence[tuple[uf.Mesh, Texture | None]]) -> np.ndarray:
+    """The frame and what its camera sees of some meshes, side by side, (H, W, 3) RGB."""
+    images = [frame.color]
+    for mesh, texture in shown:
+        rendered = render_frame(RayCaster(mesh), frame, texture=texture)
+        images.append((255 * rendered.color + 0.5).astype(np.uint8))
+    return np.hstack([cv2.resize(image, SHOWN, interpolation=cv2.INTER_AREA) for image in images])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -77,6 +91,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--texels", type=float, nargs="+", default=[5.0], metavar="MM")
     parser.add_argument("--triangles", type=float, nargs="+", default=[0.25], metavar="SHARE")
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--shown", type=int, default=10, metavar="N", help="which frame to draw")
     options = parser.parse_args()
     config = uf.Config()
     scene = SCENES[options.scene](options.data, options.frames)
@@ -127,6 +143,10 @@ def main() -> None:
                 (*said, *sizes, f"{spent + baked:.1f}"),
                 texture=as_shown(textured),
             )
+            shown = (textured.mesh, as_shown(textured)), (colored, None)
+    if options.picture:
+        image = draw(scene.held_out[options.shown], shown)
+        cv2.imwrite(str(options.picture), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
     Console(width=140).print(table)
 
 

@@ -68,15 +68,18 @@ class Atlas:
         a, b, c = (self.mesh.vertices[corners[:, k]].astype(np.float64) for k in range(3))
         return (a + s * (b - a) + t * (c - a)).astype(np.float32)
 
-    def covered(self) -> NDArray[np.bool_]:
-        """Faces (F,) that lie below another, which shows another place of the surface."""
+    def covered(self, chart: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Faces (F,) that lie below another of their `chart` (F,), which shows another place of the
+        surface.
+        """
         drawn, hidden = self.draw_faces(), np.zeros(len(self.mesh.faces), bool)
         corners = self.places[self.mesh.faces]
         for weights in LOOKED_AT:
             x, y = np.floor(np.einsum("k,nkd->dn", weights, corners)).astype(np.int64)
             x, y = np.clip(x, 0, self.width - 1), np.clip(y, 0, self.height - 1)
             above = drawn[y, x]
-            asked = np.flatnonzero((above >= 0) & (above != np.arange(len(above))))
+            own = np.arange(len(above))
+            asked = np.flatnonzero((above >= 0) & (above != own) & (chart[above] == chart))
             texels = (y * self.width + x)[asked]
             apart = self.points(texels, asked) - self.points(texels, above[asked])
             hidden[asked] |= np.linalg.norm(apart, axis=1) > ONE_PLACE * self.texel_m
@@ -95,7 +98,7 @@ def unwrap(mesh: Mesh, texel_m: float, max_side: int) -> Atlas:
     charts = cut_charts(mesh)
     for _ in range(LAYERS):
         atlas = _pack(charts, texel_m, max_side)
-        hidden = atlas.covered()
+        hidden = atlas.covered(charts.chart)
         if not hidden.any():
             return atlas
         charts, texel_m = charts.split(hidden), atlas.texel_m
