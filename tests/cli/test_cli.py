@@ -108,12 +108,16 @@ def files_in(folder: Path) -> list[str]:
         (
             [],
             2,
-            ["reconstruct, transfer, understand, query, segment, view, render, mesh, export, info, config"],
+            [
+                "reconstruct, transfer, understand, query, segment, view, render, mesh, export, info, config"
+            ],
         ),
         (
             ["reconstrukt"],
             2,
-            ["reconstruct, transfer, understand, query, segment, view, render, mesh, export, info, config"],
+            [
+                "reconstruct, transfer, understand, query, segment, view, render, mesh, export, info, config"
+            ],
         ),
         (
             ["reconstruct", "7scene", "x", "--out", "o"],
