@@ -10,6 +10,7 @@ from places import DATA
 from taichi_unifusion.datasets.synthetic import SyntheticRoom, look_at
 from taichi_unifusion.geometry.gravity import Up, find_up, smallest_turn
 from taichi_unifusion.geometry.quaternions import quaternion_to_rotation
+from taichi_unifusion.rendering.textured_scene import load_scene
 
 EXACT_DEGREES = 1.0  # on exact surfaces
 NOISY_DEGREES = 3.0  # with a Kinect's noise
@@ -193,6 +194,23 @@ def test_the_smallest_turn_and_T_up_world():
     T = up.T_up_world
     assert np.allclose(T @ (3, 1.2, 4, 1), (3, 4, 0, 1))  # a point of the floor, 1.2 m below y = 0
     assert np.allclose(Up(np.array([0, 0, 1.0]), "given").T_up_world, np.eye(4))
+
+
+@pytest.mark.parametrize("R", TURNS)
+def test_up_of_a_furnished_house(R):
+    """As it was modelled: its triangles face any way, and hidden ones are among them."""
+    house = DATA / "aws-small-house" / "house.glb"
+    if not house.exists():
+        pytest.skip(f"no data at {house}; set UNIFUSION_DATA")
+    mesh = load_scene(house).mesh()
+    cameras = [
+        look_at((3.3, -3.3, 1.45), (0.9, -2.2, 0.5)),
+        look_at((-1.8, -1.8, 1.5), (0, -2.7, 0.6)),
+    ]
+    vertices, cameras = turned(R, mesh.vertices, cameras)
+    for seen_by in (cameras, cameras[:1]):
+        up = find_up(vertices, mesh.faces, seen_by)
+        assert up.how == "floor" and off(up, R) < EXACT_DEGREES and abs(up.floor) < 0.01
 
 
 def test_up_of_real_frames():

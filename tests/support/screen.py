@@ -65,13 +65,13 @@ def run_python(code: str, folder: Path | None = None, **environment: str) -> dic
 
 
 class Keyboard:
-    """Presses keys, and moves and drags the pointer, on the screen DISPLAY."""
+    """Presses keys, and moves and drags the pointer, on a screen: that of DISPLAY, or another."""
 
-    def __init__(self) -> None:
+    def __init__(self, display: str | None = None) -> None:
         self.x11, self.xtest = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXtst.so.6")
         self.x11.XOpenDisplay.restype = ctypes.c_void_p
         self.x11.XStringToKeysym.restype = ctypes.c_ulong
-        self.display = ctypes.c_void_p(self.x11.XOpenDisplay(None))
+        self.display = ctypes.c_void_p(self.x11.XOpenDisplay(display and display.encode()))
 
     def press(self, key: str) -> None:
         """Press and let go a key by its X name, as "2", "Tab" or "Escape"."""

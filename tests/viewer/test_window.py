@@ -5,15 +5,18 @@ where there is none. Drawn by Mesa's Vulkan in software; without it these tests 
 from __future__ import annotations
 
 import os
+import pty
 import subprocess
 import sys
+import threading
 
 import cv2
 import numpy as np
 import pytest
 from places import ROOT
-from screen import PATIENCE, lavapipe, run_python, xvfb
+from screen import PATIENCE, Keyboard, lavapipe, run_python, xvfb
 
+MAIN = "import sys; from taichi_unifusion.cli.main import main; sys.exit(main(sys.argv[1:]))"
 START = """
 import json
 import numpy as np
@@ -175,11 +178,50 @@ def test_a_run_grows_in_the_window_and_goes_on_without_it():
     assert "of 12, 0 skipped" in told["said"]
 
 
+def test_questions_by_option_and_by_typing_are_answered_in_the_window(results):
+    driver = lavapipe()
+    terminal, typed = pty.openpty()
+    words = ["view", results.path, "--window", "--query", "red", "--text", results.text]
+    with xvfb() as display:
+        process = subprocess.Popen(
+            [sys.executable, "-c", MAIN, *map(str, words)],
+            env={
+                **os.environ,
+                "PYTHONPATH": str(ROOT),
+                "DISPLAY": display,
+                "VK_ICD_FILENAMES": driver,
+            },
+            stdin=typed,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        killer = threading.Timer(PATIENCE, process.kill)
+        killer.start()
+        try:
+            said = [process.stdout.readline()]
+            while said[-1] and not said[-1].startswith("type what"):
+                said.append(process.stdout.readline())
+            os.write(terminal, b"no such word\nblue\n")
+            while said[-1] and not said[-1].startswith("blue: "):
+                said.append(process.stdout.readline())
+            keyboard = Keyboard(display)
+            keyboard.move(600, 500)
+            keyboard.press("Escape")
+            _, errors = process.communicate()
+        finally:
+            killer.cancel()
+            process.kill()
+    assert process.returncode == 0, errors
+    assert said[0].startswith("red: ") and "place" in said[0] and "1. score" in said[1]
+    assert any("no such word" in line for line in said)  # what has no vector is told, and no end
+    assert said[-1].startswith("blue: ")
+
+
 def unifusion(*words, **environment) -> subprocess.CompletedProcess:
     inherited = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    code = "import sys; from taichi_unifusion.cli.main import main; sys.exit(main(sys.argv[1:]))"
     return subprocess.run(
-        [sys.executable, "-c", code, *map(str, words)],
+        [sys.executable, "-c", MAIN, *map(str, words)],
         env={**inherited, "PYTHONPATH": str(ROOT), **environment},
         capture_output=True,
         text=True,
