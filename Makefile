@@ -1,7 +1,7 @@
 # From a bare Debian or Ubuntu machine with Python 3.11-3.13 to a result: `make demo`, `make test`.
 # `make demo PYTHON=python3.12` chooses the interpreter; `make test PYTEST_ARGS="-k surface"` hands options to pytest.
 # WORKERS processes share the tests, a file at a time, so that fixtures of a file are made once; each takes 1 to 2 GB.
-.PHONY: demo test lint types format setup
+.PHONY: demo test browser lint types format setup
 
 WORKERS ?= 2
 
@@ -10,9 +10,15 @@ unexport PYTHONPATH PYTHONHOME
 
 demo: setup
 	.venv/bin/unifusion reconstruct synthetic --out results/demo
+	@echo
+	@echo "To look at it in the browser: .venv/bin/unifusion view results/demo"
 
 test: setup
 	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+
+# Chromium, for the tests that open pages; without it they skip.
+browser:
+	@bash scripts/browser.sh
 
 lint: setup
 	.venv/bin/ruff check

@@ -59,7 +59,9 @@ def view(options: View) -> int:
         raise InputError("view: say what to show, for example: unifusion view results/demo")
     from .. import runtime
     from ..viewer.results_scene import SceneOptions
+    from ..viewer.web import check_viser
 
+    check_viser()
     shown = SceneOptions(options.compare, options.cameras)
     sources = [results_source(path, shown, options.encoder) for path in options.dirs]
     scene = _scene_of(sources, options.overlay)
@@ -70,7 +72,7 @@ def view(options: View) -> int:
         raise InputError("query: is for --window; the page has a box to type in")
     viewer = open_page(options.page, scene.name)
     try:
-        from ..viewer.web_panels import ResultsPage
+        from ..viewer.web_page import ResultsPage
 
         ResultsPage(viewer, scene, sources)
         viewer.serve()
@@ -105,10 +107,13 @@ def _show_window(scene: Scene, sources: list[ResultsSource], texts: tuple[str, .
 
 
 def _scene_of(sources: list[ResultsSource], overlay: bool) -> Scene:
-    """One scene of all of them; equal names are told apart by their paths."""
+    """One scene of all of them; folders of equal names are told apart by their paths."""
     from ..viewer.scene import beside, overlaid
 
     scenes = [source.open() for source in sources]
     if len(scenes) == 1:
         return scenes[0]
+    names = [scene.name for scene in scenes]
+    if len(set(names)) < len(names):
+        scenes = [scene.named(str(each.path)) for scene, each in zip(scenes, sources, strict=True)]
     return (overlaid if overlay else beside)(scenes)

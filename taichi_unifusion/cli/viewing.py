@@ -5,14 +5,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
 from ..errors import InputError, MissingDependency
+from .options import EncoderOptions
+from .results_source import results_source
 
 if TYPE_CHECKING:
     from ..viewer.null import Watcher
+    from ..viewer.source import ResultsSource
     from ..viewer.web import WebViewer
 
 
@@ -67,9 +71,13 @@ def open_watcher(
 
         return NullViewer()
     viewer = open_page(options.page, title)
+    from ..viewer.results_scene import SceneOptions
     from ..viewer.web_live import WebLive
 
-    return WebLive(viewer, frames, stop)
+    def open_results(path: Path) -> ResultsSource:
+        return results_source(path, SceneOptions(), EncoderOptions())
+
+    return WebLive(viewer, frames, stop, open_results)
 
 
 def _open_window(title: str, frames: int, stop: Callable[[], bool]) -> Watcher:

@@ -21,7 +21,7 @@ SHARE = 0.12  # of the time of a run that watching may take
 RESOLUTION = 2  # cells a voxel of what is shown while it grows
 BACK, ABOVE = 0.8, 0.5  # [m] from where one looks at first, behind and above the camera
 LEVEL = np.cos(np.radians(40))  # of the camera's up to an axis of the world, which then is up
-FIRST_BLOCKS = 12  # of the first update, before one is known to take how long
+LEAST_BLOCKS = 16  # of an update: what every update costs is spread over them
 
 Block = tuple[int, int, int]
 
@@ -39,10 +39,12 @@ class Pace:
         return time.perf_counter() >= self.due
 
     def blocks(self) -> int:
-        """How many blocks fit into the share of one interval."""
+        """How many blocks fit into the share of one interval; where these are too few, the interval
+        gets longer.
+        """
         if not self.seconds_per_block:
-            return FIRST_BLOCKS
-        return max(1, int(SHARE * INTERVAL / self.seconds_per_block))
+            return LEAST_BLOCKS
+        return max(LEAST_BLOCKS, int(SHARE * INTERVAL / self.seconds_per_block))
 
     def took(self, seconds: float, blocks: int) -> None:
         """Note what an update of so many blocks took. The first one compiles kernels, which every
@@ -57,11 +59,14 @@ class Pace:
 
 @dataclass
 class ChangedChunks:
-    """The chunks of a growing mesh that have changed, the nearest to the camera first."""
+    """The chunks of a growing mesh that have changed: first those that were never taken, so that the
+    map grows, and of these the nearest to the camera.
+    """
 
     resolution: int = RESOLUTION
     before: MeshedSurface = field(default_factory=MeshedSurface.nothing)
     waiting: dict[Block, None] = field(default_factory=dict)  # in order of their change
+    taken: set[Block] = field(default_factory=set)
 
     def take(self, pipeline: Pipeline, frame: Frame, count: int) -> Mapping[Block, Mesh]:
         """At most `count` chunks that have changed since they were taken, by block; one that is
@@ -74,10 +79,12 @@ class ChangedChunks:
         blocks = np.array(list(self.waiting), np.int32)
         edge = MESH_BLOCK * pipeline.surface.voxel_size
         eye = frame.require_pose()[:3, 3]
-        near = np.argsort(np.linalg.norm((blocks + 0.5) * edge - eye, axis=1), kind="stable")
-        chosen = blocks[near[:count]]
+        again = [block in self.taken for block in self.waiting]
+        distance = np.linalg.norm((blocks + 0.5) * edge - eye, axis=1)
+        chosen = blocks[np.lexsort((distance, again))[:count]]
         for block in _tuples(chosen):
             del self.waiting[block]
+        self.taken.update(_tuples(chosen))
         mesh = pipeline.extract_mesh(self.resolution, blocks=chosen, flush=False)
         return split_blocks(mesh, chosen, pipeline.surface.voxel_size)
 

@@ -20,6 +20,7 @@ from ..types import Mesh, PinholeCamera, check_rigid
 UNKNOWN = (120, 120, 125)  # RGB of a vertex that has no value
 OUTLIERS = 0.5  # percent of the vertices at either end that do not count for the size of a scene
 AZIMUTHS, LOOKED_AT = 24, 50_000  # sides that an overview may be from; triangles that choose it
+DISTANCE = 1.8  # of an overview from the middle of a scene, in half its diagonal
 APART = 0.15  # of the width of a result: the gap to the next one beside it
 
 
@@ -113,7 +114,7 @@ class Layer:
             return "unknown"
         if self.legend is not None and self.legend.names:
             return self.legend.names[int(values[0])]
-        numbers = ", ".join(f"{value:.3g}" for value in values)
+        numbers = ", ".join(map(short_number, values))
         return numbers if len(values) == 1 else f"({numbers})"
 
 
@@ -229,6 +230,12 @@ class Scene:
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_up_world", check_rigid(self.T_up_world, "T_up_world"))
 
+    def named(self, name: str) -> Scene:
+        """The same scene of one mesh under another name."""
+        return replace(
+            self, name=name, meshes=tuple(replace(each, name=name) for each in self.meshes)
+        )
+
     @property
     def up(self) -> NDArray[np.float64]:
         """(3,) unit, away from gravity, in the scene."""
@@ -284,7 +291,12 @@ class Scene:
             faces = part.mesh.faces[:: max(1, len(part.mesh.faces) // LOOKED_AT)]
             shown = np.maximum(area_vectors(part.mesh.vertices, faces) @ ways.T, 0).sum(axis=0)
             towards = ways[int(shown.argmax())]
-        return center + 2.1 * max(radius, 0.1) * towards / np.linalg.norm(towards), center
+        return center + DISTANCE * max(radius, 0.1) * towards / np.linalg.norm(towards), center
+
+
+def short_number(value: float) -> str:
+    """A number as people read it: three digits, or a whole number where it has more."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def beside(scenes: Sequence[Scene]) -> Scene:

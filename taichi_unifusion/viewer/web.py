@@ -17,6 +17,7 @@ import sys
 import time
 import webbrowser
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -111,12 +112,8 @@ class WebViewer:
 
 def start_server(host: str, port: int, title: str) -> viser.ViserServer:
     """A server without a public tunnel, on `port` or the next one that is free."""
-    try:
-        import viser
-    except ImportError:
-        raise MissingDependency(
-            "the page is shown by viser: pip install 'taichi-unifusion[viewer]'"
-        ) from None
+    check_viser()
+    import viser
 
     class LocalServer(viser.ViserServer):
         """Pages could ask for a tunnel that opens the map to everybody; this one makes none."""
@@ -128,10 +125,19 @@ def start_server(host: str, port: int, title: str) -> viser.ViserServer:
     with _quiet():
         server = LocalServer(host=host, port=port, label=title, verbose=False)
     server.gui.configure_theme(
-        control_width="large", show_logo=False, show_share_button=False, brand_color=(30, 90, 160)
+        control_width="medium", show_logo=False, show_share_button=False, brand_color=(30, 90, 160)
     )
     server.gui.set_panel_label(title)
+    server.gui.main_panel.dock_right()  # beside the picture, not over it
     return server
+
+
+def check_viser() -> None:
+    """Raise MissingDependency where viser is not installed."""
+    if find_spec("viser") is None:
+        raise MissingDependency(
+            "the page is shown by viser: pip install 'taichi-unifusion[viewer]'"
+        )
 
 
 def free_port(host: str, port: int) -> int:

@@ -22,7 +22,7 @@ from .scene import Layer
 from .source import ResultsSource
 from .web import WAIT, WebViewer, fly
 from .web_nodes import glb_of
-from .web_panels import ResultsPage
+from .web_page import ResultsPage
 from .web_stage import quaternion_of
 from .web_text import paragraph, table
 
@@ -33,18 +33,25 @@ GREY = 190  # of a surface without colour
 
 
 class WebLive:
-    """Shows a run on a page; see `Watcher`. `stop` says whether the run is asked to end, so that it
-    does not wait for somebody to press a button.
+    """Shows a run of so many frames on a page; see `Watcher`. `stop` says whether the run is asked
+    to end, so that it does not wait for somebody to press a button; `open_results` gives what the
+    page shows at the end.
     """
 
-    def __init__(self, viewer: WebViewer, frames: int, stop: Callable[[], bool]) -> None:
-        self.viewer, self.frames, self.stop = viewer, frames, stop
+    def __init__(
+        self,
+        viewer: WebViewer,
+        frames: int,
+        stop: Callable[[], bool],
+        open_results: Callable[[Path], ResultsSource] = ResultsSource,
+    ) -> None:
+        self.viewer, self.frames, self.stop, self.open_results = viewer, frames, stop, open_results
         self.chunks, self.pace = ChangedChunks(), Pace()
         self.nodes: dict[Block, Any] = {}
         self.camera: Any = None
         self.path: list[np.ndarray] = []
         self.done, self.skipped = 0, []
-        self.paused = False
+        self.paused, self.updates = False, 0
         gui = viewer.server.gui
         self.folder = gui.add_folder("Run")
         with self.folder:
@@ -68,6 +75,7 @@ class WebLive:
             chunks = self.chunks.take(pipeline, frame, self.pace.blocks())
             self._show(chunks)
             self._tell(frame, step)
+            self.updates += 1
             self.pace.took(time.perf_counter() - started, len(chunks))
         while self.paused and not self.stop():
             self.viewer.poll()
@@ -79,7 +87,7 @@ class WebLive:
 
     def finish(self, directory: Path) -> None:
         """Show the results in place of what has grown, until Ctrl-C."""
-        source = ResultsSource(directory)
+        source = self.open_results(directory)
         try:
             scene = source.open()
         except UniFusionError as error:

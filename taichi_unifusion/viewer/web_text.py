@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from .picking import Hit
-from .scene import Legend, Scene
+from .scene import Legend, Scene, short_number
 
 STOPS = 17  # of the gradient of a legend
 SMALL = (
@@ -45,7 +45,7 @@ def legend_html(legend: Legend | None) -> str:
         )
         return f'<div style="{SMALL}">{title}{patches}</div>'
     numbers = "".join(
-        f"<span>{value:.3g}</span>" for value in np.linspace(legend.low, legend.high, 3)
+        f"<span>{short_number(value)}</span>" for value in np.linspace(legend.low, legend.high, 3)
     )
     bar = ""
     if len(legend.colors):

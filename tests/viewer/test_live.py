@@ -95,6 +95,18 @@ def test_the_nearest_chunks_come_first(frames):
     assert max(map(distance, first)) <= min(map(distance, rest)) and not feed.waiting
 
 
+def test_what_was_never_shown_comes_before_what_has_changed(frames):
+    pipeline = Pipeline(replace(CONFIG, window=1))
+    pipeline.step(frames[0])
+    feed = ChangedChunks()
+    first = feed.take(pipeline, frames[0], 5)
+    for frame in frames[1:4]:
+        pipeline.step(frame)
+    changed = set(first) & set(feed.take(pipeline, frames[3], len(feed.waiting)))
+    assert changed == set()
+    assert set(first) & set(feed.take(pipeline, frames[3], 1000))
+
+
 def test_watching_keeps_to_its_share_of_the_time(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])

@@ -10,6 +10,7 @@ import pytest
 from colored_results import NAMES
 from ports import some_port
 
+from taichi_unifusion.cli import main as cli
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.files.meshes import write_mesh
@@ -22,7 +23,7 @@ pytest.importorskip("viser", reason="the page needs viser: pip install 'taichi-u
 
 from taichi_unifusion.viewer.web import WebViewer, has_screen
 from taichi_unifusion.viewer.web_nodes import BANDS, KEPT_LAYERS
-from taichi_unifusion.viewer.web_panels import ResultsPage
+from taichi_unifusion.viewer.web_page import ResultsPage
 
 SCENE_FILE = "mesh.ply"
 
@@ -163,11 +164,11 @@ def test_the_mesh_is_extracted_again_finer_or_coarser(page):
 
 def test_cameras_come_with_what_they_saw_and_go(page):
     page.layers.cameras.value = True
-    page.layers._show_cameras()
+    page.layers.show_cameras()
     assert len(page.stage.cameras) == 3
     assert all(camera.image is not None for camera in page.scene.cameras)
     page.layers.cameras.value = False
-    page.layers._show_cameras()
+    page.layers.show_cameras()
     assert page.stage.cameras == []
 
 
@@ -184,9 +185,15 @@ def test_a_question_is_answered_by_heat_boxes_labels_and_a_list(page):
     red = page.scene.meshes[0].layer("query: red").values[:, 0]
     color = page.scene.meshes[0].layer("color").colors.astype(float)
     assert color[red > 0.5][:, 0].mean() > color[red > 0.5][:, 1:].mean()
+    assert (
+        len(page.results.shared_scene.boxes)
+        == len(page.results.shared_scene.labels)
+        == len(page.ask.rows)
+    )
     page.ask.text.value = ""
     page.ask.ask()
     assert page.stage.marked["answer"] == [] and page.ask.rows == []
+    assert page.results.shared_scene.boxes == ()
 
 
 @pytest.mark.parametrize("text", ["/etc/passwd", "<b>purple</b>"])
@@ -279,3 +286,49 @@ def test_words_of_files_are_escaped():
     legend = Legend("<i>label</i>", np.zeros((1, 3), np.uint8), names=("<script>",))
     assert "<i>" not in legend_html(legend) and "<script>" not in legend_html(legend)
     assert "<" not in paragraph("<").replace("<div", "").replace("</div", "")
+
+
+# ---- the command ----
+
+
+@pytest.fixture
+def not_serving(monkeypatch) -> list[list[str]]:
+    """Nodes of the pages that commands left when they began to wait."""
+    left: list[list[str]] = []
+
+    def serve(viewer: WebViewer, stop=None) -> None:
+        left.append(list(viewer.server.scene._handle_from_node_name))
+
+    monkeypatch.setattr(WebViewer, "serve", serve)
+    return left
+
+
+def test_the_command_says_where_the_page_is_and_shows_results_side_by_side(
+    results, not_serving, capsys
+):
+    port = some_port()
+    words = ["view", str(results.path), str(results.path / SCENE_FILE), "--port", str(port)]
+    assert cli.main([*words, "--no-open"]) == 0
+    said = capsys.readouterr().err
+    assert f"http://127.0.0.1:{port}" in said
+    assert "to ask, give the text encoder that belongs to them, with --text" in said
+    assert {"/mesh0", "/mesh1"} <= {
+        f"/{name.split('/')[1]}" for name in not_serving[0] if "/" in name
+    }
+
+
+@pytest.mark.parametrize(
+    "words, told",
+    [
+        ([], "say what to show"),
+        (["{tmp}/none"], "none: no such file or folder"),
+        (["{tmp}"], "mesh.ply: no such file; give a results folder"),
+        (["{results}", "--port", "99999"], "port: must lie in 1..65535"),
+        (["{results}", "--compare", "{tmp}/other.ply"], "other.ply: no such file"),
+    ],
+)
+def test_what_cannot_be_shown_is_said_in_a_sentence(words, told, results, tmp_path, capsys):
+    words = [word.format(tmp=tmp_path, results=results.path) for word in words]
+    assert cli.main(["view", *words, "--no-open"]) == 2
+    said = capsys.readouterr().err
+    assert told in said and "Traceback" not in said

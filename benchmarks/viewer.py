@@ -1,0 +1,178 @@
+"""What the viewers cost: bytes a page is sent and seconds until it has them, by number of triangles;
+the shared page; and what watching a run adds to its time.
+
+    python benchmarks/viewer.py page --triangles 200000 1000000 5000000
+    python benchmarks/viewer.py live 7scenes PATH --end 150 --every 3
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import viser
+
+import taichi_unifusion as uf
+from taichi_unifusion.datasets import FORMATS
+from taichi_unifusion.results.tables import format_bytes, format_table
+from taichi_unifusion.viewer.page import write_page
+from taichi_unifusion.viewer.results_scene import layers_of
+from taichi_unifusion.viewer.scene import Scene, SceneMesh
+from taichi_unifusion.viewer.source import ResultsSource
+from taichi_unifusion.viewer.web import WebViewer
+from taichi_unifusion.viewer.web_live import WebLive
+from taichi_unifusion.viewer.web_page import ResultsPage
+
+QUIET = 1.0  # [s] without a message after which a page has everything
+EXTENT = 5.0  # [m] of the surface that is shown
+REPEATS = 3  # of a run, watched and not
+
+
+def main() -> None:
+    """Measure what is asked for, and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(required=True)
+    page = commands.add_parser("page", help="a surface of so many triangles")
+    page.add_argument("--triangles", type=int, nargs="+", default=[200_000, 1_000_000, 5_000_000])
+    page.set_defaults(run=measure_pages)
+    live = commands.add_parser("live", help="a run, watched and not")
+    live.add_argument("format", choices=FORMATS)
+    live.add_argument("path", nargs="?")
+    live.add_argument("--end", type=int)
+    live.add_argument("--every", type=int, default=1)
+    live.set_defaults(run=measure_live)
+    options = parser.parse_args()
+    logging.basicConfig(level=logging.WARNING)
+    options.run(options)
+
+
+def measure_pages(options: argparse.Namespace) -> None:
+    """Show waves of so many triangles."""
+    uf.init()
+    rows = [
+        ["triangles", "shown", "ready s", "sent", "received s", "layer s", "click ms", "page file"]
+    ]
+    for triangles in options.triangles:
+        scene = waves(triangles)
+        started = time.perf_counter()
+        viewer = WebViewer()
+        page = ResultsPage(viewer, scene, [ResultsSource(Path("."))])
+        ready = time.perf_counter() - started
+        sent, received = asyncio.run(receive(viewer.server.get_port()))
+        switching = time.perf_counter()
+        page.layers.show("height")
+        switched = time.perf_counter() - switching
+        clicks = [click(page) for _ in range(3)]
+        viewer.close()
+        with tempfile.TemporaryDirectory() as folder:
+            write_page(scene, Path(folder) / "page.html")
+            size = (Path(folder) / "page.html").stat().st_size
+        rows.append(
+            [
+                f"{triangles:,}",
+                f"{page.scene.triangles:,}",
+                f"{ready:.1f}",
+                format_bytes(sent),
+                f"{received:.1f}",
+                f"{switched:.2f}",
+                f"{1e3 * min(clicks):.0f}",
+                format_bytes(size),
+            ]
+        )
+    print(format_table(rows))
+
+
+def waves(triangles: int) -> Scene:
+    """A coloured floor with waves, of about so many triangles."""
+    steps = int(np.sqrt(triangles / 2))
+    x, y = np.meshgrid(*[np.linspace(0, EXTENT, steps + 1, dtype=np.float32)] * 2, indexing="ij")
+    z = 0.2 * np.sin(3 * x) * np.sin(2 * y) + 0.01 * np.sin(40 * x * y)
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    index = np.arange((steps + 1) ** 2, dtype=np.int32).reshape(steps + 1, steps + 1)
+    a, b, c, d = (
+        part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
+    )
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    mesh = uf.Mesh(points, faces).with_attribute("color", 0.5 + 0.5 * np.sin(5 * points))
+    bare = Scene("waves", ())
+    return Scene("waves", (SceneMesh("waves", mesh, layers_of(mesh, None, bare)),))
+
+
+async def receive(port: int) -> tuple[int, float]:
+    """Bytes that a page gets when it opens, and seconds until the last of them."""
+    import websockets
+
+    started, last, count = time.perf_counter(), 0.0, 0
+    protocol = websockets.Subprotocol(f"viser-v{viser.__version__}")
+    async with websockets.connect(
+        f"ws://127.0.0.1:{port}", subprotocols=[protocol], max_size=None
+    ) as page:
+        while True:
+            try:
+                message = await asyncio.wait_for(page.recv(), QUIET)
+            except TimeoutError:
+                return count, last
+            last, count = time.perf_counter() - started, count + len(message)
+
+
+def click(page: ResultsPage) -> float:
+    """Seconds that the answer to a click takes."""
+    started = time.perf_counter()
+    page.point.click(np.array([EXTENT / 2, EXTENT / 2, 5.0]), np.array([0.1, 0.1, -1.0]))
+    assert page.point.last is not None
+    return time.perf_counter() - started
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What a run took, and what of it was watching."""
+
+    seconds: float
+    updates: int
+
+
+def measure_live(options: argparse.Namespace) -> None:
+    """Run a recording with and without a page that watches, by turns."""
+    recording = uf.open_dataset(options.format, options.path)
+    frames = recording[: options.end : options.every]
+    uf.warm_up()
+    one_run(frames, watched=True)  # compiles what meshing needs
+    alone = [one_run(frames, watched=False).seconds for _ in range(REPEATS)]
+    watched = [one_run(frames, watched=True) for _ in range(REPEATS)]
+    least, least_watched = min(alone), min(run.seconds for run in watched)
+    print(
+        format_table(
+            [
+                ["run", "s", "updates"],
+                ["alone", f"{least:.2f}", "-"],
+                ["watched", f"{least_watched:.2f}", str(watched[0].updates)],
+            ]
+        )
+        + f"\nwatching adds {100 * (least_watched / least - 1):.0f} %"
+    )
+
+
+def one_run(frames: object, watched: bool) -> Watched:
+    pipeline = uf.Pipeline()
+    if not watched:
+        started = time.perf_counter()
+        pipeline.run(frames)
+        return Watched(time.perf_counter() - started, 0)
+    viewer = WebViewer()
+    live = WebLive(viewer, len(frames), lambda: False)
+    try:
+        started = time.perf_counter()
+        pipeline.run(frames, on_step=live.on_step, on_skip=live.on_skip)
+        return Watched(time.perf_counter() - started, live.updates)
+    finally:
+        viewer.close()
+
+
+if __name__ == "__main__":
+    main()

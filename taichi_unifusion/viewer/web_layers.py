@@ -1,0 +1,110 @@
+"""The controls of a page that choose what is seen: which layer and results, how high, how fine, the
+cameras.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .scene import SceneCamera
+from .web_results import ShownResults
+from .web_stage import quaternion_of
+from .web_text import legend_html, paragraph
+
+if TYPE_CHECKING:
+    import viser
+
+
+class LayerPanel:
+    """Which layer, which results, how high, how fine."""
+
+    def __init__(self, results: ShownResults) -> None:
+        self.results, stage, gui = results, results.stage, results.viewer.server.gui
+        request = results.viewer.request
+        self.layer = gui.add_dropdown("Layer", stage.scene.layer_names)
+        self.layer.on_update(lambda _: request(self.show_chosen))
+        self.legend = gui.add_html("")
+        if len(stage.scene.meshes) > 1:
+            for i, mesh in enumerate(stage.scene.meshes):
+                box = gui.add_checkbox(mesh.name, True)
+                box.on_update(
+                    lambda event, i=i: request(
+                        lambda: results.stage.set_visible(i, event.target.value), event.client
+                    )
+                )
+        low, high = stage.scene.heights()
+        step = max((high - low) / 100, 1e-3)
+        self.height = gui.add_slider(
+            "Cut above [m]", round(low, 3), round(high + step, 3), step, round(high + step, 3)
+        )
+        self.height.on_update(lambda _: request(self._cut))
+        self.cameras = gui.add_checkbox("Cameras", False, disabled=not stage.scene.cameras)
+        self.cameras.on_update(lambda event: request(self.show_cameras, event.client))
+        if any(source.has_maps for source in results.sources):
+            self.resolution = gui.add_slider("Cells a voxel", 1, 8, 1, 4)
+            again = gui.add_button("Extract the mesh again")
+            again.on_click(lambda event: request(lambda: self._extract(event.client), event.client))
+        self.notes = gui.add_html("")
+        self.refresh()
+
+    def show(self, name: str) -> None:
+        """Choose a layer, as the user of the page would."""
+        self.layer.options = self.results.scene.layer_names
+        self.layer.value = name
+        self.show_chosen()
+
+    def show_chosen(self) -> None:
+        """Show the layer that is chosen, with its legend."""
+        self.results.stage.show_layer(self.layer.value)
+        meshes = self.results.scene.meshes
+        shown = [mesh.layer(self.layer.value) for mesh in meshes]
+        self.legend.content = legend_html(
+            next((each.legend for each in shown if each.name == self.layer.value), None)
+        )
+
+    def refresh(self) -> None:
+        """Say what there is now."""
+        if self.layer.options != self.results.scene.layer_names:
+            self.layer.options = self.results.scene.layer_names
+        self.notes.content = "".join(
+            paragraph(
+                f"{mesh.name}: {mesh.note or f'{len(mesh.mesh.faces):,} triangles, all of them'}"
+            )
+            for mesh in self.results.scene.meshes
+        )
+        self.show_chosen()
+
+    def _cut(self) -> None:
+        self.results.stage.cut_above(self.height.value)
+
+    def show_cameras(self) -> None:
+        """Draw the cameras with what they saw, or take them away, as the box says."""
+        stage, viewer = self.results.stage, self.results.viewer
+        if not self.cameras.value:
+            stage.hide_cameras()
+            return
+        if len(self.results.sources) == 1 and not any(
+            each.image is not None for each in stage.scene.cameras
+        ):
+            stage.scene = self.results.sources[0].with_images(stage.scene)
+        stage.show_cameras(
+            stage.scene.cameras,
+            lambda client, camera: viewer.request(lambda: look_from(client, camera), client),
+        )
+
+    def _extract(self, client: viser.ClientHandle | None) -> None:
+        results, resolution = self.results, int(self.resolution.value)
+        results.viewer.say("Extracting", f"{resolution} cells a voxel, from the saved maps", client)
+        for i, source in enumerate(results.sources):
+            if source.has_maps:
+                whole = source.extract(results.scene, results.wholes[i], resolution)
+                results.replace_mesh(i, whole)
+        self.refresh()
+        results.viewer.say("Extracted", f"{results.scene.triangles:,} triangles are shown", client)
+
+
+def look_from(client: viser.ClientHandle, camera: SceneCamera) -> None:
+    """Put the camera of a page where one of the recording was."""
+    with client.atomic():
+        client.camera.wxyz = quaternion_of(camera.T_world_camera)
+        client.camera.position = camera.T_world_camera[:3, 3]
