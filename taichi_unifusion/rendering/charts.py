@@ -2,7 +2,7 @@
 
 A map's surface is mostly walls, floors and boards, so its triangles are sorted by the nearest of
 six directions, those of the room. xatlas cuts surfaces as well, triangle by triangle with a cost
-that looks ahead; that took 0.2 ms a triangle, fifty times as long, and gave more charts.
+that looks ahead; that took 0.2 ms a triangle, thirty times as long as this with the packing, and gave more charts.
 """
 
 from __future__ import annotations
