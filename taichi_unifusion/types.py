@@ -43,6 +43,17 @@ def check_rigid(T: NDArray, name: str = "T_world_camera") -> NDArray[np.float64]
     return T
 
 
+def largest_magnitude(values: NDArray[np.float32]) -> float:
+    """The largest |value| that is finite; 0 where there is none."""
+    if not values.size:
+        return 0.0
+    largest = max(float(values.max()), -float(values.min()))
+    if np.isfinite(largest):
+        return largest
+    finite = values[np.isfinite(values)]
+    return float(np.abs(finite).max()) if len(finite) else 0.0
+
+
 @dataclass(frozen=True)
 class ImageView:
     """An image, depth or features, and where it was taken from."""
@@ -135,6 +146,11 @@ class Frame:
         # one pass: a sum is finite only if all its terms are
         marks = {name: "" if np.isfinite(x.sum()) else "?" for name, x in self.images.items()}
         return frozenset(color).union(name + mark for name, mark in marks.items())
+
+    @cached_property
+    def largest(self) -> Mapping[str, float]:
+        """The largest magnitude in each image of a property, of the values that are finite."""
+        return {name: largest_magnitude(image) for name, image in self.images.items()}
 
     @property
     def attributes(self) -> frozenset[str]:

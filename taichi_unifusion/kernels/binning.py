@@ -13,7 +13,7 @@ from .cells import BLOCK_CELLS, CELLS, cell_bit, cell_center, cell_in_lattice, c
 from .index import INDEX_HALF, block_in, in_range, touch, voxel_of
 
 FIXED = float(1 << 24)  # fixed-point one: steps of 6e-8, room for 5e11 in sums
-
+Scales = ti.types.vector(3, ti.f32)  # powers of two that bring values to where these steps are fine
 
 # Columns of `keys` after a block's voxel: bits of the frames that saw points in it, or samples.
 POINT_FRAMES, SAMPLE_FRAMES = 3, 4
@@ -31,14 +31,15 @@ def bin_points(
     values_1: Floats2,  # (R slots, c_1)
     values_2: Floats2,  # (R slots, c_2)
     channels: ti.template(),  # c_i of the three
+    scales: Scales,  # of the three
     per_meter: ti.f32,
     frame: ti.i32,  # a bit for the frame of its window
     with_positions: ti.template(),
     index: ti.template(),
     # in and out:
     keys: Ints2,  # (B, 5) POINT_FRAMES |= frame
-    # (B, 64, 1 + sum of c_i [+ 3]) += pixels, their values side by side, and their position from the
-    # cell centre [voxels]
+    # (B, 64, 1 + sum of c_i [+ 3]) += pixels, their scaled values side by side, and their position
+    # from the cell centre [voxels]
     sums: Sums3,
 ):
     for part in range(found.shape[0]):
@@ -64,8 +65,9 @@ def bin_points(
                 run += count
                 weight = ti.cast(count, ti.f32)
                 for i, values in ti.static(enumerate((values_0, values_1, values_2))):
+                    scaled = weight * scales[i]
                     for c in ti.static(range(channels[i])):
-                        total[ti.static(sum(channels[:i])) + c] += values[n, c] * weight
+                        total[ti.static(sum(channels[:i])) + c] += values[n, c] * scaled
                 if ti.static(with_positions):
                     for d in ti.static(range(3)):
                         total[width - 3 + d] += (x[d] - at[d] - 0.5) / CELLS * weight
@@ -229,6 +231,7 @@ def compact_cells(
     rows: Ints2,  # (B, 3) first row of each block, points, frames
     masks: Masks2,  # (B, 2) cells that hold points
     channels: ti.template(),
+    units: Floats1,  # (c,) of the sums: one over the scales
     # in and out:
     sums: Sums3,  # (B, 64, 1 + c) counts first; read, then 0
     # out:
@@ -247,7 +250,7 @@ def compact_cells(
                 scale = 1.0 / (root * FIXED)
                 cells[row, 0] = root
                 for c in ti.static(range(channels)):
-                    cells[row, 1 + c] = ti.cast(sums[b, cell, 1 + c], ti.f32) * scale
+                    cells[row, 1 + c] = ti.cast(sums[b, cell, 1 + c], ti.f32) * scale * units[c]
                     sums[b, cell, 1 + c] = ti.i64(0)
                 sums[b, cell, 0] = ti.i64(0)
                 row += 1

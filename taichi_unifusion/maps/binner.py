@@ -55,14 +55,16 @@ class Binner:
         """How many values are summed in a cell."""
         return self.channels + 3 * self.with_positions
 
-    def open(self, arrays: CellArrays) -> OpenCells:
-        """No points yet, in arrays of this binner's width that hold none."""
+    def open(self, arrays: CellArrays, exponents: tuple[int, ...] = ()) -> OpenCells:
+        """No points yet, in arrays of this binner's width that hold none; `exponents` of the powers
+        of two that the values of each channel are divided by.
+        """
         assert arrays.width == self.width
         if self.grid.unclosed is not None:  # an exception came between; its keys are there still
             keys = self.grid.unclosed.keys
             forget_blocks(0, keys.shape[0], keys, self.grid.index)
         self.grid.unclosed = arrays
-        return OpenCells(arrays, self.grid.next_frame(), 0)
+        return OpenCells(arrays, self.grid.next_frame(), 0, exponents)
 
     def touch(self, cells: OpenCells, patches: Patches) -> OpenCells:
         """Make room for the voxels that patches lie in; nothing is summed yet.
@@ -94,8 +96,12 @@ class Binner:
         """
         arrays = [each.values for each in values]
         counts = values[0].counts if values else patches.counts
+        firsts = np.cumsum([0, *(array.shape[1] for array in arrays[:-1])])
+        scales = [2.0 ** -int(cells.exponents[i]) if cells.exponents else 1.0 for i in firsts]
         if len(arrays) > TOGETHER:
-            arrays = [*arrays[: TOGETHER - 1], _side_by_side(arrays[TOGETHER - 1 :])]
+            rest = slice(TOGETHER - 1, None)
+            arrays = [*arrays[: TOGETHER - 1], _side_by_side(arrays[rest], scales[rest])]
+            scales[rest] = [1.0]
         nothing = TOGETHER - len(arrays)
         channels = tuple(array.shape[1] for array in arrays) + (0,) * nothing
         values_0, values_1, values_2 = [*arrays, *[patches.points] * nothing]
@@ -108,6 +114,7 @@ class Binner:
             values_1,
             values_2,
             channels,
+            kernels.Scales([*scales, *[1.0] * nothing]),
             1.0 / self.voxel_size,
             1 << frame,
             self.with_positions,
@@ -122,12 +129,15 @@ class Binner:
         """
         return self._compact(cells, arena)
 
-    def bin(self, patches: Patches, values: Sequence[Values]) -> Binned:
-        """Average what patches carry, side by side.
+    def bin(
+        self, patches: Patches, values: Sequence[Values], exponents: tuple[int, ...] = ()
+    ) -> Binned:
+        """Average what patches carry, side by side; `exponents` as in `open`.
 
         Raises OutOfRange for points beyond the index range.
         """
-        cells = self.touch(self.open(self._shared("cells", self.width)), patches)
+        opened = self.open(self._shared("cells", self.width), exponents)
+        cells = self.touch(opened, patches)
         self.add(cells, patches, values)
         return self.close(cells, self.grid.runtime.arena)
 
@@ -206,7 +216,9 @@ class Binner:
         rows[:, 0] = np.cumsum(rows[:, 0]) - rows[:, 0]
         room = max(total, FIRST_BLOCKS)
         averages = arena.borrow("averages", ti.f32, (room, 1 + arrays.width))
-        kernels.compact_cells(n, rows, masks, arrays.width, arrays.sums, averages)
+        units = np.ones(max(arrays.width, 1), np.float32)
+        units[: len(cells.exponents)] = 2.0 ** np.array(cells.exponents, np.float64)
+        kernels.compact_cells(n, rows, masks, arrays.width, units, arrays.sums, averages)
         find_neighbors(self.grid.index, cells.stamp, n, keys, neighbors)
         forget_blocks(0, n, keys, self.grid.index)
         if n:
@@ -283,7 +295,10 @@ def patches_of(cloud: PointCloud, device: str) -> Patches:
     return Patches(slots, found, cloud.points, counts, cloud.normals, attributes, n, pixels, (0, 0))
 
 
-def _side_by_side(arrays: Sequence[DeviceArray]) -> NDArray[np.float32]:
-    """Arrays of values (N, c) as one."""
+def _side_by_side(arrays: Sequence[DeviceArray], scales: Sequence[float]) -> NDArray[np.float32]:
+    """Arrays of values (N, c), each times its scale, as one."""
     rows = [each if isinstance(each, np.ndarray) else each.to_numpy() for each in arrays]
-    return np.hstack([each[: min(map(len, rows))] for each in rows])
+    few = min(map(len, rows))
+    return np.hstack(
+        [each[:few] * np.float32(scale) for each, scale in zip(rows, scales, strict=True)]
+    )

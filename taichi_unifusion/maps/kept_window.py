@@ -30,6 +30,7 @@ class KeptCells:
     keys: NDArray[np.int32]  # (B, 5) voxels, and bits of the frames that saw each
     cells: NDArray[np.int32]  # (M,) cells that hold points, by block
     sums: NDArray[np.int64]  # (M, 1 + c) counts, and fixed-point sums
+    exponents: tuple[int, ...]  # of the sums, as `OpenCells` has them
 
     @classmethod
     def of(cls, open_cells: OpenCells) -> KeptCells:
@@ -38,7 +39,7 @@ class KeptCells:
         sums = arrays.sums.to_numpy()[:n].reshape(n * BLOCK_CELLS, -1)
         cells = np.flatnonzero(sums[:, 0]).astype(np.int32)
         keys = arrays.keys.to_numpy()[:n]
-        return cls(keys, cells, sums[cells].copy())
+        return cls(keys, cells, sums[cells].copy(), open_cells.exponents)
 
     @property
     def nbytes(self) -> int:
@@ -52,7 +53,7 @@ class KeptCells:
             np.float32
         )
         patches = patches_of(PointCloud(centers), binner.grid.runtime.device)
-        touched = binner.touch(binner.open(arrays), patches)
+        touched = binner.touch(binner.open(arrays, self.exponents), patches)
         # blocks have other numbers now
         order = np.argsort(_codes(self.keys))[
             np.argsort(np.argsort(_codes(arrays.keys.to_numpy()[:n])))

@@ -80,6 +80,7 @@ class OpenCells:
     arrays: CellArrays
     stamp: int  # of these blocks in the index of the grid
     count: int  # blocks
+    exponents: tuple[int, ...] = ()  # of the first columns: values / 2^e are summed; 0 of others
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,14 @@ from .. import runtime
 from ..errors import InputError
 from ..kernels.patches import Patches, Values
 from ..runtime import DeviceArray
-from ..types import Frame, PointCloud
+from ..types import Frame, PointCloud, largest_magnitude
 from .base_map import check_channels
 from .binner import Binner, patches_of
 from .encoder import Encoder
 from .local_lim import LocalLim
 from .regression_map import RegressionMap
 from .settings import PropertySettings
+from .value_scale import by_channel, exponent_of
 
 NEAREST_REACH = 2  # voxels
 
@@ -117,4 +118,6 @@ def encode_values(
         values = np.hstack([each.observed(cloud) for each in maps])
         return encoder.encode_samples(binner.sort(cloud.points, values))
     patches = patches_of(cloud, binner.grid.runtime.device)
-    return encoder.encode(binner.bin(patches, [each.carried(patches) for each in maps]))
+    exponents = [exponent_of(largest_magnitude(each.observed(cloud))) for each in maps]
+    carried = [each.carried(patches) for each in maps]
+    return encoder.encode(binner.bin(patches, carried, by_channel(maps, exponents)))

@@ -29,6 +29,7 @@ from .local_lim import CellArrays, OpenCells
 from .property_group import MapGroup, Part
 from .regression_map import RegressionMap
 from .surface_map import SurfaceMap
+from .value_scale import exponents_for, fits
 
 # A window ends where the camera has moved this far from its first frame [m, degrees]: from there
 # fewer voxels are shared, and a window that a loop moves would bend.
@@ -100,6 +101,12 @@ class Window:
         near = moved <= FARTHEST_MOVE and np.degrees(turned) <= LARGEST_TURN
         return near and frame.camera == self.camera
 
+    def has_room_for(self, frame: Frame) -> bool:
+        """Whether the values of a frame are of a size that can be summed with those before."""
+        return all(
+            fits(each.part.maps, each.cells.exponents, frame) for each in self.parts.values()
+        )
+
     def add(self, frame: Frame, find: FindPatches, reach: float) -> tuple[Patches, dict[str, int]]:
         """Sum up a frame, whose depth image is already there; returns its patches, and by name how
         many voxels of a map were not in the window before.
@@ -140,6 +147,8 @@ class Window:
         """The part of surface or colour alone, if all that a frame may see lies in its range."""
         part = self.parts.get(names)
         if part is None or not part.part.binner.reaches(frame.require_pose(), reach):
+            return None
+        if part.cells.exponents:  # colours are added to these as they are
             return None
         return part if names != ("color",) or "color" not in frame.images else None
 
@@ -276,7 +285,7 @@ class WindowFusion:
             frame.camera,
             frame.carried,
             self._images[0],
-            {part.names: self._open(part) for part in parts},
+            {part.names: self._open(part, frame) for part in parts},
             others,
         )
         patches, touched = window.add(frame, find, reach)
@@ -362,14 +371,16 @@ class WindowFusion:
 
     def _continues(self, window: Window, frame: Frame) -> bool:
         gap = self._stride and abs(frame.index - self._index) > GAP * self._stride
-        return not gap and frame.carried == window.carried and window.is_near(frame)
+        same = frame.carried == window.carried and window.has_room_for(frame)
+        return not gap and same and window.is_near(frame)
 
-    def _open(self, part: Part) -> OpenPart:
+    def _open(self, part: Part, frame: Frame) -> OpenPart:
         if part.names not in self._room:
             self._room[part.names] = CellArrays(part.binner.width), Arena()
         self._known[part.names] = part
         arrays, arena = self._room[part.names]
-        return OpenPart(part, part.binner.open(arrays), arena)
+        exponents = exponents_for(part.maps, frame)
+        return OpenPart(part, part.binner.open(arrays, exponents), arena)
 
     def _free_images(self, frame: Frame) -> DeviceArray:
         """Room for the views of a window that begins; those of the one before may still vote."""

@@ -97,14 +97,17 @@ class Blocks:
     def sample_frames(self) -> list[int]:
         return self.keys[: self.count, binning.SAMPLE_FRAMES].tolist()
 
-    def bin(self, *clouds: PointCloud, with_positions: bool = True) -> np.ndarray:
+    def bin(
+        self, *clouds: PointCloud, with_positions: bool = True, scale: float = 1.0
+    ) -> np.ndarray:
         """Sums (ROOM, 64, 1 + 3 [+ 3]), counts first, of clouds one after the other."""
         sums = np.zeros((ROOM, 64, 7 if with_positions else 4), np.int64)
         for n, cloud in enumerate(clouds):
             found, points, counts, normals = in_runs(cloud)
             nothing, channels, index = [points] * 2, (3, 0, 0), self.grid.index
+            scales = binning.Scales([scale, 1.0, 1.0])
             binning.bin_points(
-                found, SLOTS, points, counts, normals, *nothing, channels, 1 / VS,
+                found, SLOTS, points, counts, normals, *nothing, channels, scales, 1 / VS,
                 int(np.int32(np.uint32(1 << n))), with_positions, index, self.keys, sums,
             )  # fmt: skip
         return sums
@@ -272,10 +275,13 @@ def test_normals_that_cancel_give_no_samples(grid):
     assert not samples.any() and not surfels.any() and blocks.sample_frames == [0]
 
 
-def test_mark_and_compact_cells_equal_their_twins(grid, cloud):
+@pytest.mark.parametrize("exponent", [0, -7, 30])
+def test_mark_and_compact_cells_equal_their_twins(grid, cloud, exponent):
     clouds = cloud, moved(taken(cloud, slice(300)), (0.07, 0, 0))
     blocks = touch(grid, *clouds)
-    sums = blocks.bin(*clouds, with_positions=False)
+    unit = 2.0**exponent  # values are unit times the clouds' normals
+    clouds = [replace(each, normals=each.normals * np.float32(unit)) for each in clouds]
+    sums = blocks.bin(*clouds, with_positions=False, scale=1 / unit)
     n, voxels = blocks.count, blocks.voxels
     blocks.keys[:, binning.SAMPLE_FRAMES] = np.arange(ROOM)
     bits = blocks.keys.copy()
@@ -298,7 +304,8 @@ def test_mark_and_compact_cells_equal_their_twins(grid, cloud):
         np.testing.assert_array_equal(keys[:, :3], bits[:, :3])
     rows[:, 0] = np.cumsum(rows[:, 0]) - rows[:, 0]
     cells = np.zeros((len(averages), 4), np.float32)
-    binning.compact_cells(n, rows, masks, 3, sums, cells)
+    binning.compact_cells(n, rows, masks, 3, np.full(3, unit, np.float32), sums, cells)
+    cells[:, 1:] /= unit
     np.testing.assert_allclose(cells, averages, rtol=FIXED, atol=FIXED)
     assert not sums.any()
 
