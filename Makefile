@@ -1,7 +1,7 @@
 # From a bare Debian or Ubuntu machine with Python 3.11-3.13 to a result: `make demo`, `make test`.
 # `make demo PYTHON=python3.12` chooses the interpreter; `make test PYTEST_ARGS="-k surface"` hands options to pytest.
 # WORKERS processes share the tests, a file at a time, so that fixtures of a file are made once; each takes 1 to 2 GB.
-.PHONY: demo test browser lint types format setup
+.PHONY: demo test browser validator lint types format setup
 
 WORKERS ?= 2
 
@@ -19,6 +19,11 @@ test: setup
 # Chromium, for the tests that open pages; without it they skip.
 browser:
 	@bash scripts/browser.sh
+
+# Khronos's validator, for the tests of GLB files; without npm or a network they skip.
+validator: setup
+	@npm install --silent --no-save --prefix .venv gltf-validator@2.0.0-dev.3.10 || \
+		echo "validator: npm cannot install gltf-validator; the tests that ask it are skipped" >&2
 
 lint: setup
 	.venv/bin/ruff check
