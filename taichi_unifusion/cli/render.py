@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -100,7 +100,7 @@ def render(options: Render) -> int:
         Picturing(scene, layer, camera, options.samples, not options.no_legend) for scene in scenes
     ]
     with (
-        stop_on_signal(clean_up=lambda: None) as stop,
+        stop_on_signal(clean_up=lambda: _remove_unfinished(options.out)) as stop,
         sink() as write,
         frame_progress(len(poses)) as on_frame,
     ):
@@ -243,6 +243,13 @@ def _opened(options: Render, folder: Path, size: tuple[int, int]) -> Iterator[Wr
         finally:
             if poses and subfolders:
                 _write_poses(folder, poses)
+
+
+def _remove_unfinished(out: Path) -> None:
+    """Remove what a process leaves of a video that is ended at once."""
+    for path in out.parent.glob(f".{out.name}.*.tmp"):
+        with suppress(OSError):
+            path.unlink()
 
 
 def _beside(pictures: list[NDArray], size: tuple[int, int], gap: int) -> NDArray:
