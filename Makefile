@@ -1,7 +1,7 @@
 # From a bare Debian or Ubuntu machine with Python 3.11-3.13 to a result: `make demo`, `make test`.
 # `make demo PYTHON=python3.12` chooses the interpreter; `make test PYTEST_ARGS="-k surface"` hands options to pytest.
 # WORKERS processes share the tests, a file at a time, so that fixtures of a file are made once; each takes 1 to 2 GB.
-.PHONY: demo test browser validator lint types format setup
+.PHONY: demo test viewers validator lint types format setup
 
 WORKERS ?= 2
 
@@ -16,9 +16,9 @@ demo: setup
 test: setup
 	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
-# Chromium, for the tests that open pages; without it they skip.
-browser:
-	@bash scripts/browser.sh
+# Chromium, a screen in memory and Vulkan in software, for the tests of pages and windows; without them these skip.
+viewers:
+	@bash scripts/viewers.sh
 
 # Khronos's validator, for the tests of GLB files; without npm or a network they skip.
 validator: setup

@@ -34,7 +34,7 @@ def open_browser() -> Any:
     program = next(filter(None, map(shutil.which, PROGRAMS)), None)
     driver = shutil.which("chromedriver")
     if program is None or driver is None:
-        pytest.skip("no chromium with its chromedriver; `make browser` installs them on Debian")
+        pytest.skip("no chromium with its chromedriver; `make viewers` installs them on Debian")
     options = webdriver.ChromeOptions()
     options.binary_location = program
     for flag in (*FLAGS, f"--window-size={SIZE[0]},{SIZE[1]}"):
