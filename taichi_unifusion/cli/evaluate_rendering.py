@@ -44,7 +44,7 @@ class EvaluateRendering:
     """
 
     reconstruction: Annotated[Positional[Path], arg(metavar="RESULTS|MESH")]
-    """Results folder of `unifusion reconstruct`, or a mesh file, whose vertex colours are judged.
+    """Results folder of `unifusion reconstruct`, or a mesh file, whose texture or vertex colours are judged.
     """
     format: Annotated[
         Positional[str | None], arg(metavar="[FORMAT]", help_behavior_hint=RUN_DEFAULT)
@@ -98,11 +98,11 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     from .. import runtime
     from ..config import Config
     from ..evaluation.rendering import evaluate_rendering as evaluate
-    from ..files.mesh_reading import read_any_mesh
+    from ..files.mesh_reading import read_textured_mesh
     from ..results.reader import find_run
 
     run = find_run(options.reconstruction)
-    mesh = run.mesh() if run else read_any_mesh(options.reconstruction)
+    mesh, texture = (run.mesh(), None) if run else read_textured_mesh(options.reconstruction)
     recording, run = _recording(options, run)
     if options.color_camera is not None:
         recording, _ = found_color(*given_color(recording, options.color_camera))
@@ -120,6 +120,7 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
             mesh,
             _usable(recording, chosen, T_run_recording, on_frame),
             color=color.query if color else None,
+            texture=texture,
             depth_min=limits.depth_min if options.depth_min is None else options.depth_min,
             depth_max=limits.depth_max if options.depth_max is None else options.depth_max,
         )
@@ -129,7 +130,7 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
         "reconstruction": options.reconstruction,
         "recording": recording.name,
         "used_by_the_run": sorted(used),
-        "colour": "map" if color else "vertices",
+        "colour": "map" if color else "texture" if texture else "vertices",
     }
     compared = f"{len(used) or 'none'} of which the run has used" if run else "from file"
     return show(

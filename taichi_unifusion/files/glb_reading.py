@@ -1,4 +1,5 @@
-"""Meshes read back from the GLB files that `glb` writes: exactly, in the map's world, colours as sRGB."""
+"""Meshes read back from the GLB files that `glb` writes: exactly, in the map's world,
+colours as sRGB."""
 
 from __future__ import annotations
 
@@ -11,17 +12,19 @@ from numpy.typing import NDArray
 
 from ..types import Mesh
 from .glb import GENERATOR, TYPES
+from .images import decode_color
 from .srgb import linear_to_srgb
+from .texture import Texture
 
 NUMBERS = {code: kind for kind, code in TYPES.items()}
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
 
 
-def parse_own_glb(data: bytes) -> Mesh | None:
-    """The mesh in the bytes of a GLB file that we wrote, without its texture; None for any other
-    file, ours of before 0.2 included, which hold colours otherwise.
+def parse_own_glb(data: bytes) -> tuple[Mesh, Texture | None] | None:
+    """The mesh and its texture, if it has one, in the bytes of a GLB file that we wrote; None for any
+    other file, those of earlier versions included, which hold colours as bytes.
 
-    Raises ValueError, KeyError, IndexError or struct.error where the file is damaged.
+    Raises ValueError, KeyError, IndexError, struct.error or FrameError where the file is damaged.
     """
     if data[:4] != b"glTF":
         return None
@@ -49,4 +52,9 @@ def parse_own_glb(data: bytes) -> Mesh | None:
     if faces.max() >= len(vertices):
         raise ValueError(f"a triangle names vertex {faces.max()} of {len(vertices)}")
     attributes = {"color": linear_to_srgb(columns["COLOR_0"])} if "COLOR_0" in columns else {}
-    return Mesh(vertices, faces.astype(np.int32), columns.get("NORMAL"), attributes)
+    mesh = Mesh(vertices, faces.astype(np.int32), columns.get("NORMAL"), attributes)
+    if "TEXCOORD_0" not in columns:
+        return mesh, None
+    view = said["bufferViews"][said["images"][0]["bufferView"]]
+    picture = body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    return mesh, Texture(columns["TEXCOORD_0"], decode_color(picture, "its texture"))

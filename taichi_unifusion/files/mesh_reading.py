@@ -12,6 +12,7 @@ from ..types import Mesh
 from .atomic import read_bytes
 from .glb_reading import parse_own_glb
 from .ply_reading import parse_ply
+from .texture import Texture
 
 SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")
 
@@ -33,6 +34,11 @@ def read_any_mesh(path: str | Path) -> Mesh:
     Raises FileError where the file is missing or damaged, InputError for a suffix that is not a
     mesh's.
     """
+    return read_textured_mesh(path)[0]
+
+
+def read_textured_mesh(path: str | Path) -> tuple[Mesh, Texture | None]:
+    """What `read_any_mesh` reads, and the texture where the file is a GLB of ours that has one."""
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -42,13 +48,13 @@ def read_any_mesh(path: str | Path) -> Mesh:
     if not path.is_file():
         raise FileError(f"{path}: no such file")
     if suffix == ".ply":
-        return read_mesh(path)
+        return read_mesh(path), None
     try:
         if suffix == ".glb" and (own := parse_own_glb(read_bytes(path))):
             return own
         import trimesh  # a second of import
 
-        return _joined(trimesh.load_scene(path, process=False))
+        return _joined(trimesh.load_scene(path, process=False)), None
     except Exception as error:  # noqa: BLE001 - its readers raise whatever they stumble over
         reason = " ".join(str(error).split())[:200]
         raise FileError(

@@ -199,8 +199,8 @@ def load_scene(path: str | Path) -> TexturedScene:
         ) from None
     try:
         own = parse_own_glb(read_bytes(path)) if Path(path).suffix.lower() == ".glb" else None
-        if own is not None and "color" in own.attributes:
-            return _colored(own)
+        if own is not None and "color" in own[0].attributes:
+            return _colored(own[0])
         scene: Any = trimesh.load(str(path), force="scene", process=False)
         # sorted: the same order in every run
         placed = [(name, *scene.graph[name]) for name in sorted(scene.graph.nodes_geometry)]

@@ -12,7 +12,7 @@ from validators import gltf_validator
 
 from taichi_unifusion.errors import FileError, InputError
 from taichi_unifusion.files.glb import write_glb
-from taichi_unifusion.files.mesh_reading import read_any_mesh
+from taichi_unifusion.files.mesh_reading import read_any_mesh, read_textured_mesh
 from taichi_unifusion.files.meshes import write_mesh
 from taichi_unifusion.files.texture import Texture
 from taichi_unifusion.types import Mesh
@@ -151,7 +151,10 @@ def test_glb_holds_a_texture(tmp_path, mesh, image):
     assert shown.shape == texture.image.shape
     off = np.abs(shown.astype(int) - texture.image)
     assert off.max() == 0 if image == "png" else off.mean() < 3
-    assert "color" not in read_any_mesh(tmp_path / "a.glb").attributes
+    read, found = read_textured_mesh(tmp_path / "a.glb")
+    assert "color" not in read.attributes and np.array_equal(read.vertices, mesh.vertices)
+    assert np.array_equal(found.coordinates, texture.coordinates)
+    assert np.array_equal(found.image, shown)
 
 
 def test_glb_normals_have_unit_length(tmp_path, mesh):
