@@ -7,7 +7,7 @@ nor mip levels bring in what is not on the surface.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files.ply import color_to_uint8
 from ..files.texture import Texture
+from ..geometry.triangles import areas
 from ..types import Mesh
 from .atlas import Atlas, unwrap
 from .mesh_checks import check_mesh
 
 TEXEL_M = 0.005
 MAX_SIDE, SIDES = 4096, (16, 16_384)  # texels: the default, and what can be asked for
+MIN_AREA = 1e-12  # [m^2] of a triangle; smaller ones have no normal, and are left out
 REACH = 2.0  # texels beyond a chart where its plane still says what is there
 CHUNK = 1 << 19  # texels queried at once
 LENDERS = 200_000  # texels that lend their colour to those without one
@@ -54,7 +56,9 @@ def bake(
             f"texture: need a texel wider than 0 m and {SIDES[0]}..{SIDES[1]} texels a side, got "
             f"{texel_m:g} and {max_side}"
         )
-    atlas = unwrap(check_mesh(mesh, "texture"), texel_m, max_side)
+    mesh = check_mesh(mesh, "texture")
+    seen = areas(mesh.vertices, mesh.faces) > MIN_AREA
+    atlas = unwrap(replace(mesh, faces=mesh.faces[seen]), texel_m, max_side)
     nearest, distance = nearest_faces(atlas)
     shown = np.flatnonzero(distance <= REACH)
     colors, known = np.empty((len(shown), 3), np.float32), np.empty(len(shown), bool)

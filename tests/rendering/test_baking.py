@@ -136,6 +136,16 @@ def test_triangles_smaller_than_a_texel_have_their_own_color():
     assert off.max() < 2 * TEXEL
 
 
+def test_triangles_without_an_area_are_left_out():
+    whole = ball()
+    flat = np.array([[0, 0, 1], [5, 9, 9]], np.int32)
+    mesh = Mesh(whole.vertices, np.concatenate([flat, whole.faces]), whole.normals)
+    made = bake(mesh, ramp, texel_m=TEXEL, max_side=512)
+    assert len(made.mesh.faces) == len(whole.faces)
+    points, coordinates = on_surface(made)
+    assert np.abs(made.texture.at(coordinates) - ramp(points)[0]).max() < 2 * TEXEL
+
+
 def test_a_texture_that_would_be_too_large_gets_wider_texels():
     small = bake(ball(), ramp, texel_m=0.001, max_side=200)
     assert max(small.texture.image.shape) <= 200 and small.texel_m > 0.005
