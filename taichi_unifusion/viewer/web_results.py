@@ -25,6 +25,8 @@ class ShownResults:
         """`sources` (M,) are where the meshes of the scene came from."""
         self.viewer, self.sources = viewer, tuple(sources)
         self.wholes = list(scene.meshes)  # before they were decimated for the page
+        if scene.triangles > MOST_TRIANGLES:
+            logger.info("%s triangles are simplified for the page", f"{scene.triangles:,}")
         shown = decimate_scene(scene, MOST_TRIANGLES)
         for mesh in shown.meshes:
             if mesh.note:
