@@ -2,6 +2,7 @@
 frames' own poses.
 
     python benchmarks/rendering.py 7scenes PATH --end 200 --every 10
+    python benchmarks/rendering.py 7scenes PATH --end 200 --every 10 --register
     python benchmarks/rendering.py replica PATH --depth-max 10
     python benchmarks/rendering.py 7scenes PATH --end 200 --every 10 --config configs/paper.yaml
 
@@ -19,6 +20,7 @@ import numpy as np
 
 import taichi_unifusion as uf
 from taichi_unifusion import runtime
+from taichi_unifusion.datasets import estimate_color_camera
 from taichi_unifusion.evaluation import evaluate_rendering
 
 
@@ -33,11 +35,23 @@ def main() -> None:
     parser.add_argument("--depth-max", type=float, default=5.0)
     parser.add_argument("--resolution", type=int, default=4)
     parser.add_argument("--config")
+    parser.add_argument(
+        "--register",
+        action="store_true",
+        help="find the colour camera, and register colour with it",
+    )
     options = parser.parse_args()
     live = uf.init()
     config = uf.load_config(options.config) if options.config else uf.Config()
     settings = dataclasses.replace(config.preprocess, depth_max=options.depth_max)
-    frames = list(uf.open_dataset(options.format, options.path)[: options.end : options.every])
+    recording = uf.open_dataset(options.format, options.path)[: options.end]
+    if options.register:
+        start = time.process_time()
+        estimate = estimate_color_camera(recording)
+        print(f"colour: {estimate.verdict} ({time.process_time() - start:.1f} s of processor time)")
+        if estimate.camera:
+            recording = recording.with_color_camera(estimate.camera)
+    frames = list(recording[:: options.every])
     surface, color = uf.SurfaceMap(config.surface), uf.PropertyMap("color", 3, config.color)
 
     def integrate(frame: uf.Frame) -> float:

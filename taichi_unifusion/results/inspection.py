@@ -105,6 +105,8 @@ def _describe_mesh(file: Path) -> str:
 def _describe_run(file: Path) -> str:
     record = read_record(file)
     lines = [] if record.recording is None else [_describe_recording(record.recording)]
+    if record.recording and (color := record.recording.color) and color.camera:
+        lines.append(f"colour  {color.verdict}")
     lines.append(f"frames  {count_frames(record.frames)}")
     made = f"made    by taichi_unifusion {record.versions.get('taichi_unifusion', '?')} on {record.device_name}"
     if frame := record.milliseconds.get("frame"):

@@ -54,6 +54,11 @@ def test_the_camera_is_found_and_kept(made):
     np.testing.assert_allclose(run.recording.color_camera.T_color_depth, kept.T_color_depth)
 
 
+def test_info_says_how_colour_was_registered(made, capsys):
+    assert cli.main(["info", str(made)]) == 0
+    assert "colour  estimated: turned by" in capsys.readouterr().out
+
+
 def test_evaluation_compares_with_images_of_the_same_camera(made, capsys):
     registered, raw = scores(capsys, made), scores(capsys, made, "--color-camera", "none")
     again = scores(capsys, made, "--color-camera", made / "color_camera.yaml")
