@@ -47,7 +47,8 @@ def largest_magnitude(values: NDArray[np.float32]) -> float:
     """The largest |value| that is finite; 0 where there is none."""
     if not values.size:
         return 0.0
-    largest = max(float(values.max()), -float(values.min()))
+    high, low = (ends.reduce(values, axis=None) for ends in (np.fmax, np.fmin))  # pass NaN over
+    largest = max(float(high), -float(low))
     if np.isfinite(largest):
         return largest
     finite = values[np.isfinite(values)]
