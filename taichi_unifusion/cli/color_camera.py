@@ -10,6 +10,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from ..datasets import Dataset
+from ..datasets.loading import recording_of
 from ..errors import InputError
 from ..results.record import ColorRecord
 
@@ -43,13 +44,18 @@ def given_color(recording: Dataset, choice: str) -> tuple[Dataset, ColorRecord]:
 
 
 def found_color(recording: Dataset, record: ColorRecord) -> tuple[Dataset, ColorRecord]:
-    """Of "auto", the recording with the colour camera that its frames tell of, where they do; and of
-    another choice, with poses that were found meanwhile, its clock offset applied to them.
+    """Of "auto", the recording with the colour camera that its frames tell of, where they do; and
+    with one that is known, the same with its clock offset applied to poses found meanwhile.
     """
     if record.choice != AUTO:
-        return of_record(recording, record), record
+        from ..results.reader import registered_as
+
+        return registered_as(recording, record), record
     from ..datasets.color_estimation import estimate_color_camera
 
+    own = getattr(recording_of(recording), "color_camera", None)
+    if own is not None:
+        recording = recording.with_color_camera(own)
     if not recording.registered:
         logger.info("looking whether colour fits depth")
     estimate = estimate_color_camera(recording)
@@ -63,10 +69,3 @@ def found_color(recording: Dataset, record: ColorRecord) -> tuple[Dataset, Color
         frames=estimate.frames,
     )
     return (recording if camera is None else recording.with_color_camera(camera)), record
-
-
-def of_record(recording: Dataset, record: ColorRecord) -> Dataset:
-    """The recording with the colour camera of a run."""
-    from ..results.reader import registered_as
-
-    return registered_as(recording, record)

@@ -11,9 +11,15 @@ from tiny_recording import FLAGS, write_folder
 from two_cameras import TwoCameras, rig_beside
 
 from taichi_unifusion.cli import main as cli
+from taichi_unifusion.cli.color_camera import found_color, given_color
+from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.color_camera import read_color_camera, write_color_camera
+from taichi_unifusion.datasets.loading import recording_of
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
+from taichi_unifusion.geometry import se3
 from taichi_unifusion.results import read_run
+from taichi_unifusion.tracking import TrackedFrame, TrackingResult, Verdict
+from taichi_unifusion.tracking.sequence import PosedFrames
 
 CAMERA = SyntheticRoom(frames=1, width=160, height=120).camera
 RIG = rig_beside(CAMERA, turn=(0.5, -1.0, 0.5), move=(0.025, 0, 0), focal=0.9)
@@ -108,6 +114,26 @@ def test_the_recordings_own_camera_comes_first(tmp_path, capsys):
     color = json.loads((out / "metrics.json").read_text())["recording"]["color"]
     assert color["verdict"] == "registered by the recording itself"
     assert scores(capsys, out)["psnr_db"] > scores(capsys, out, "--color-camera", "none")["psnr_db"]
+
+
+@pytest.mark.parametrize("choice", ["auto", "FILE"])
+def test_a_clock_offset_goes_by_the_poses_that_are_found(choice, tmp_path):
+    """Of the recording's own camera, and of one that is given; not by poses that nobody was to use."""
+    late, frames = replace(RIG, clock_offset=0.02), list(TwoCameras(RIG, frames=FRAMES)[:3])
+    folder = write_folder(tmp_path / "recording", frames)
+    write_color_camera(tmp_path / "late.yaml", late)
+    if choice == "auto":
+        write_color_camera(folder / "color_camera.yaml", late)
+    given, record = given_color(
+        open_dataset("folder", folder),
+        choice if choice == "auto" else str(tmp_path / "late.yaml"),
+    )
+    assert recording_of(given.without_poses()).twists is None
+    moved = [se3.exp(np.array([0.01 * i, 0, 0, 0, 0, 0])) for i in range(3)]
+    tracked = [TrackedFrame(i, Verdict.TRACKED, T) for i, T in enumerate(moved)]
+    posed, _ = found_color(PosedFrames(given, TrackingResult(tuple(tracked))), record)
+    found = recording_of(posed).twists
+    np.testing.assert_allclose(found, np.tile([0.3, 0, 0, 0, 0, 0], (3, 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize(
