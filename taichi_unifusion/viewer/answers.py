@@ -26,7 +26,7 @@ class ShownAnswer:
     layer: Layer
     boxes: tuple[Box, ...]
     labels: tuple[Label, ...]
-    rows: tuple[str, ...]  # one a box: rank, score, area and size in words
+    rows: tuple[str, ...]  # one a box: rank, score and area in words
     sentence: str  # what was found, or that nothing was
 
     def moved(self, by: NDArray) -> ShownAnswer:
@@ -66,7 +66,8 @@ def relevance_layer(mesh: Mesh, text: str, relevance: NDArray) -> Layer:
     table = np.stack([np.interp(levels, at, np.array(heat)[:, k]) for k in range(3)], axis=1)
     legend = Legend(f"relevance to '{text}', 0.5: a draw", (255 * table + 0.5).astype(np.uint8))
     values = np.asarray(relevance, np.float32)[:, None]
-    return Layer(layer_name(text), (255 * colors + 0.5).astype(np.uint8), values, legend)
+    shown = (255 * colors + 0.5).astype(np.uint8)
+    return Layer(layer_name(text), shown, values, legend, shaded=True)
 
 
 def layer_name(text: str) -> str:
@@ -75,5 +76,4 @@ def layer_name(text: str) -> str:
 
 
 def _describe(region: Region) -> str:
-    size = " x ".join(f"{edge:.2f}" for edge in region.box[1] - region.box[0])
-    return f"score {region.score:.2f}, {region.area:.2f} m², {size} m"
+    return f"score {region.score:.2f}, {region.area:.2f} m²"

@@ -17,7 +17,7 @@ from ..pipeline import Pipeline
 from ..types import Frame, Mesh
 
 INTERVAL = 1.0  # [s] between two updates
-SHARE = 0.12  # of the time of a run that watching may take
+SHARE = 0.1  # of the time of a run that watching may take
 RESOLUTION = 2  # cells a voxel of what is shown while it grows
 BACK, ABOVE = 0.8, 0.5  # [m] from where one looks at first, behind and above the camera
 LEVEL = np.cos(np.radians(40))  # of the camera's up to an axis of the world, which then is up

@@ -152,7 +152,7 @@ def _columns(faces: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 def _encode_layer(blob: _Blob, layer: Layer) -> dict[str, Any]:
     """Values of one channel as steps of their range; else the colours."""
     legend = layer.legend
-    said: dict[str, Any] = {"name": layer.name, "lit": layer.values is not None}
+    said: dict[str, Any] = {"name": layer.name, "lit": layer.lit}
     if legend is not None:
         said["legend"] = _encode_legend(legend)
     if layer.values is not None and layer.values.shape[1] == 1 and legend is not None:

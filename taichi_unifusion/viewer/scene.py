@@ -45,6 +45,12 @@ class Layer:
     colors: NDArray[np.uint8]  # (V, 3) RGB sRGB
     values: NDArray[np.float32] | None = None  # (V, c), NaN where unknown; None: the colours
     legend: Legend | None = None
+    shaded: bool = False  # values that are shown with the light and dark of the colours
+
+    @property
+    def lit(self) -> bool:
+        """Whether light is to be added: colours of a recording hold theirs already."""
+        return self.values is not None and not self.shaded
 
     def __post_init__(self) -> None:
         if self.colors.ndim != 2 or self.colors.shape[1] != 3 or self.colors.dtype != np.uint8:

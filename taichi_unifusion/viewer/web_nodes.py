@@ -122,11 +122,10 @@ def glb_of(mesh: Mesh, layer: Layer, kept: NDArray[np.bool_]) -> bytes:
     that shapes can be seen.
     """
     rows, faces = np.unique(mesh.faces[kept], return_inverse=True)
-    lit = layer.values is not None
-    normals = mesh.normals[rows] if lit and mesh.normals is not None else None
+    normals = mesh.normals[rows] if layer.lit and mesh.normals is not None else None
     part = Mesh(mesh.vertices[rows], faces.reshape(-1, 3).astype(np.int32), normals)
     file = io.BytesIO()
-    write_glb(file, part.with_attribute("color", layer.colors[rows] / 255), lit=lit)
+    write_glb(file, part.with_attribute("color", layer.colors[rows] / 255), lit=layer.lit)
     return file.getvalue()
 
 

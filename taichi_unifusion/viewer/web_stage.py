@@ -36,6 +36,7 @@ EDGES = [
     (5, 7),
     (6, 7),
 ]
+FIELD = 0.85  # [rad] of the first view, upright
 MARK, LINE = (255, 80, 40), 3.0  # RGB; [pixels]
 
 
@@ -55,6 +56,7 @@ class Stage:
         eye, center = scene.overview()
         server.scene.set_up_direction(scene.up)
         server.initial_camera.up = scene.up
+        server.initial_camera.fov = FIELD
         server.initial_camera.position, server.initial_camera.look_at = eye, center
         for i, shown in enumerate(scene.meshes):
             self.nodes.append(MeshNodes(server, f"/mesh{i}", shown, self._bands_of(shown)))
