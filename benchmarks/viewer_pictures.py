@@ -96,8 +96,7 @@ def picture_page(options: argparse.Namespace, browser: Any) -> None:
         page.layers.cameras.value = True
         page.layers.show_cameras()
     if options.ask:
-        page.ask.text.value = options.ask
-        page.ask.ask()
+        page.ask.put(options.ask)
     wait_still(browser, viewer.poll)
     if options.click:
         click_middle(browser)

@@ -10,15 +10,18 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ..errors import InputError
 from .interrupts import stop_on_signal
-from .options import OPTIONAL, EncoderOptions
+from .options import ONE_EACH, OPTIONAL, EncoderOptions
 from .results_source import results_source
 from .terminal import DONE
-from .viewing import PageOptions, open_page
+from .viewing import PageOptions
 
 if TYPE_CHECKING:
     from ..viewer.answers import ShownAnswer
     from ..viewer.scene import Scene
     from ..viewer.source import ResultsSource
+
+
+NOTHING_TO_ASK = "{}: there are no features to ask, or no text encoder"
 
 
 @dataclass(frozen=True)
@@ -46,9 +49,9 @@ class View:
     """Show a window on the screen instead of a page in the browser."""
     query: Annotated[
         UseAppendAction[tuple[str, ...]],
-        arg(metavar="TEXT", help_behavior_hint="(with --window; give it once for each)"),
+        arg(metavar="TEXT", help_behavior_hint=ONE_EACH),
     ] = ()
-    """What to look for; more can be typed in the terminal. The page has a box to type in."""
+    """What to look for; more can be typed into the page, or into the terminal of a window."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
     encoder: Annotated[EncoderOptions, arg(name="")] = field(default_factory=EncoderOptions)
 
@@ -59,22 +62,33 @@ def view(options: View) -> int:
         raise InputError("view: say what to show, for example: unifusion view results/demo")
     from .. import runtime
     from ..viewer.results_scene import SceneOptions
-    from ..viewer.web import check_viser
 
-    check_viser()
+    if not options.window:
+        from ..viewer.web import check_viser
+
+        check_viser()  # before any work
     shown = SceneOptions(options.compare, options.cameras)
     sources = [results_source(path, shown, options.encoder) for path in options.dirs]
     scene = _scene_of(sources, options.overlay)
     runtime.init(options.encoder.device)
     if options.window:
         return _show_window(scene, sources, options.query)
-    if options.query:
-        raise InputError("query: is for --window; the page has a box to type in")
-    viewer = open_page(options.page, scene.name)
-    try:
-        from ..viewer.web_page import ResultsPage
+    return _show_page(scene, sources, options)
 
-        ResultsPage(viewer, scene, sources)
+
+def _show_page(scene: Scene, sources: list[ResultsSource], options: View) -> int:
+    """Results on a page, until Ctrl-C."""
+    from ..viewer.web import WebViewer
+    from ..viewer.web_page import ResultsPage
+
+    viewer = WebViewer(options.page.host, options.page.port, scene.name)
+    try:
+        page = ResultsPage(viewer, scene, sources)
+        for text in options.query:
+            if page.ask is None:
+                raise InputError(NOTHING_TO_ASK.format(scene.name))
+            page.ask.put(text)
+        viewer.announce(open_browser=not options.page.no_open)
         viewer.serve()
     finally:
         viewer.close()
@@ -90,7 +104,7 @@ def _show_window(scene: Scene, sources: list[ResultsSource], texts: tuple[str, .
 
     def ask(text: str) -> ShownAnswer:
         if asked is None:
-            raise InputError(f"{scene.name}: there are no features to ask, or no text encoder")
+            raise InputError(NOTHING_TO_ASK.format(scene.name))
         return asked.ask(scene.meshes[sources.index(asked)], text)
 
     try:

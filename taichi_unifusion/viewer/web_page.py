@@ -37,6 +37,7 @@ class ResultsPage:
         gui = viewer.server.gui
         with gui.add_folder("Show"):
             self.layers = LayerPanel(results)
+        self.ask: AskPanel | None = None  # where there is nothing to ask
         if any(source.has_features for source in sources):
             with gui.add_folder("Ask"):
                 self.ask = AskPanel(results, self.layers.show)

@@ -39,6 +39,11 @@ class AskPanel:
         self.rows: list[Any] = []
         self.folder = gui.add_folder("Answers", visible=False)
 
+    def put(self, text: str) -> None:
+        """Ask as the user of the page would."""
+        self.text.value = text
+        self.ask()
+
     def ask(self, client: viser.ClientHandle | None = None) -> None:
         """Ask all results that can be asked, and show what they answer."""
         text, results = self.text.value.strip(), self.results

@@ -217,7 +217,7 @@ def test_what_is_not_here_is_said(viewer, results, tmp_path):
 
 def test_results_without_features_have_no_text_box(viewer, results):
     page = ResultsPage(viewer, ResultsSource(results.path).open(), [ResultsSource(results.path)])
-    assert not hasattr(page, "ask")
+    assert page.ask is None
 
 
 # ---- points and parts ----
@@ -317,10 +317,20 @@ def test_the_command_says_where_the_page_is_and_shows_results_side_by_side(
     }
 
 
+def test_the_command_asks_what_it_is_told_to(results, not_serving):
+    words = ["view", str(results.path), "--port", str(some_port()), "--no-open"]
+    assert cli.main([*words, "--text", results.text, "--query", "red", "--query", "green"]) == 0
+    layers = {
+        bytes.fromhex(name.split("/")[2]).decode() for name in not_serving[0] if "/mesh0/" in name
+    }
+    assert {"query: red", "query: green"} <= layers
+
+
 @pytest.mark.parametrize(
     "words, told",
     [
         ([], "say what to show"),
+        (["{results}", "--query", "red"], "there are no features to ask, or no text encoder"),
         (["{tmp}/none"], "none: no such file or folder"),
         (["{tmp}"], "mesh.ply: no such file; give a results folder"),
         (["{results}", "--port", "99999"], "port: must lie in 1..65535"),
