@@ -4,7 +4,7 @@ which are loaded when they are first needed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -27,9 +27,28 @@ if TYPE_CHECKING:
     from ..maps import FeatureMap, PropertyMap, SurfaceMap
     from ..networks.encoders import TextEncoder
 
+PIECE = 64  # blocks that are extracted at once
 WORDS = 5  # that are nearest to the features at a point
 # gives the text encoder that belongs to features of a source, which is named after their network
 MakeEncoder = Callable[[str, Path], "TextEncoder"]
+
+
+def welded(pieces: Sequence[Mesh]) -> Mesh:
+    """One mesh of pieces with normals that share the vertices of their borders to the last bit."""
+    pieces = [piece for piece in pieces if len(piece.faces)] or list(pieces[:1])
+    vertices = np.concatenate([piece.vertices for piece in pieces])
+    normals = np.concatenate([piece.normals for piece in pieces if piece.normals is not None])
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces[:-1])])
+    faces = np.concatenate([piece.faces + at for piece, at in zip(pieces, starts, strict=True)])
+    bits = np.ascontiguousarray(vertices).view(np.dtype((np.void, 3 * vertices.itemsize)))
+    _, first, number = np.unique(bits.ravel(), return_index=True, return_inverse=True)
+    attributes = {
+        name: np.concatenate([piece.attributes[name] for piece in pieces])[first]
+        for name in pieces[0].attributes
+    }
+    return Mesh(
+        vertices[first], number.reshape(-1)[faces].astype(np.int32), normals[first], attributes
+    )
 
 
 @dataclass(frozen=True)
@@ -84,16 +103,31 @@ class ResultsSource:
     def _beside(self) -> RunFolder:
         return self.folder or RunFolder(self.path.parent)
 
-    def extract(self, scene: Scene, shown: SceneMesh, resolution: int) -> SceneMesh:
+    def extract(
+        self,
+        scene: Scene,
+        shown: SceneMesh,
+        resolution: int,
+        on_piece: Callable[[int, int], None] = lambda done, total: None,
+    ) -> SceneMesh:
         """The mesh again in the place of `shown`, of so many cells a voxel, with all its layers;
-        raises InputError for a resolution that cannot be, FileError or MapCorrupt where a map
+        `on_piece` is told how many of its blocks are done.
+
+        Raises InputError for a resolution that cannot be, FileError or MapCorrupt where a map
         cannot be read.
         """
+        from ..maps.meshing import drop_small_parts, mesh_blocks
         from ..pipeline import extract_mesh
 
         folder = self._folder
         settings = load_config(folder.config).mesh if folder.config.exists() else MeshSettings()
-        mesh = extract_mesh(self._surface, self._properties, resolution, settings.min_area)
+        surface, pieces = self._surface, []
+        blocks = mesh_blocks(surface.grid.voxel_keys())
+        for first in range(0, len(blocks), PIECE):
+            part = blocks[first : first + PIECE]
+            pieces.append(extract_mesh(surface, self._properties, resolution, blocks=part))
+            on_piece(min(first + PIECE, len(blocks)), len(blocks))
+        mesh = drop_small_parts(welded(pieces), settings.min_area)
         layers = layers_of(mesh, folder, scene, self.options.compare)
         return SceneMesh(shown.name, mesh, layers).moved(shown.offset)
 

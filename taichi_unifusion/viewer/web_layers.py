@@ -44,6 +44,7 @@ class LayerPanel:
             self.resolution = gui.add_slider("Cells a voxel", 1, 8, 1, 4)
             again = gui.add_button("Extract the mesh again")
             again.on_click(lambda event: request(lambda: self._extract(event.client), event.client))
+            self.progress = gui.add_progress_bar(0.0, visible=False)
         self.notes = gui.add_html("")
         self.refresh()
 
@@ -94,13 +95,17 @@ class LayerPanel:
 
     def _extract(self, client: viser.ClientHandle | None) -> None:
         results, resolution = self.results, int(self.resolution.value)
-        results.viewer.say("Extracting", f"{resolution} cells a voxel, from the saved maps", client)
+        self.progress.value, self.progress.visible = 0.0, True
         for i, source in enumerate(results.sources):
             if source.has_maps:
-                whole = source.extract(results.scene, results.wholes[i], resolution)
+                whole = source.extract(results.scene, results.wholes[i], resolution, self._piece)
                 results.replace_mesh(i, whole)
+        self.progress.visible = False
         self.refresh()
         results.viewer.say("Extracted", f"{results.scene.triangles:,} triangles are shown", client)
+
+    def _piece(self, done: int, total: int) -> None:
+        self.progress.value = 100 * done / total
 
 
 def look_from(client: viser.ClientHandle, camera: SceneCamera) -> None:

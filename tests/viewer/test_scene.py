@@ -20,6 +20,7 @@ from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.files.meshes import write_mesh
 from taichi_unifusion.maps import SurfaceMap
 from taichi_unifusion.rendering.look import Look
+from taichi_unifusion.viewer import source as source_module
 from taichi_unifusion.viewer.results_scene import SceneOptions, open_scene
 from taichi_unifusion.viewer.scene import Layer, Scene, SceneMesh, beside, overlaid
 from taichi_unifusion.viewer.source import ResultsSource
@@ -84,6 +85,26 @@ def test_the_cameras_are_those_of_the_trajectory_with_what_they_saw(results):
     seen = source.with_images(source.open()).cameras
     assert len(seen) == 3 and seen[1].image.shape == (30, 40, 3)
     assert seen[1].image.std() > 1
+
+
+def test_a_mesh_extracted_in_pieces_is_the_whole(results, monkeypatch):
+    monkeypatch.setattr(source_module, "PIECE", 3)
+    source, told = ResultsSource(results.path), []
+    scene = source.open()
+    again = source.extract(scene, scene.meshes[0], 4, lambda *done: told.append(done)).mesh
+    whole = scene.meshes[0].mesh  # as the run wrote it
+    assert len(told) > 2 and told[-1][0] == told[-1][1]
+    assert len(again.vertices) == len(whole.vertices) and len(again.faces) == len(whole.faces)
+    order = [np.lexsort(mesh.vertices.T) for mesh in (again, whole)]
+    assert np.array_equal(again.vertices[order[0]], whole.vertices[order[1]])
+    color, saliency = (again.attributes[name][order[0]] for name in ("color", "saliency"))
+    stored, same = (whole.attributes[name][order[1]] for name in ("color", "saliency"))
+    assert np.abs(np.clip(color, 0, 1) - stored).max() <= EIGHT_BITS
+    assert np.array_equal(saliency, same)
+    centers = [
+        np.sort(mesh.vertices[mesh.faces].mean(axis=1).sum(axis=1)) for mesh in (again, whole)
+    ]
+    assert np.abs(centers[0] - centers[1]).max() < EXACT
 
 
 def test_cameras_stay_where_the_recording_is_gone(results, tmp_path):

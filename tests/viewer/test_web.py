@@ -153,6 +153,7 @@ def test_the_mesh_is_extracted_again_finer_or_coarser(page):
     before = len(page.scene.meshes[0].mesh.faces)
     page.layers.resolution.value = 2
     page.layers._extract(None)
+    assert page.layers.progress.value == 100 and not page.layers.progress.visible
     after = page.scene.meshes[0]
     assert 0.1 * before < len(after.mesh.faces) < 0.5 * before
     assert {"color", "saliency", "weight", "height"} <= set(page.scene.layer_names)
