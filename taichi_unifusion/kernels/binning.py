@@ -13,7 +13,8 @@ from .cells import BLOCK_CELLS, CELLS, cell_bit, cell_center, cell_in_lattice, c
 from .index import INDEX_HALF, block_in, in_range, touch, voxel_of
 
 FIXED = float(1 << 24)  # fixed-point one: steps of 6e-8, room for 5e11 in sums
-Scales = ti.types.vector(3, ti.f32)  # powers of two that bring values to where these steps are fine
+# Voxels a metre, then powers of two that bring the values of three arrays to where these steps are fine.
+Scales = ti.types.vector(4, ti.f32)
 
 # Columns of `keys` after a block's voxel: bits of the frames that saw points in it, or samples.
 POINT_FRAMES, SAMPLE_FRAMES = 3, 4
@@ -31,8 +32,7 @@ def bin_points(
     values_1: Floats2,  # (R slots, c_1)
     values_2: Floats2,  # (R slots, c_2)
     channels: ti.template(),  # c_i of the three
-    scales: Scales,  # of the three
-    per_meter: ti.f32,
+    scales: Scales,  # of the points, and of the values of the three
     frame: ti.i32,  # a bit for the frame of its window
     with_positions: ti.template(),
     index: ti.template(),
@@ -51,7 +51,7 @@ def bin_points(
         for n in range(part * slots, part * slots + found[part]):
             count = counts[n]
             if count > 0:
-                x = row3(points, n) * (per_meter * CELLS)
+                x = row3(points, n) * (scales[0] * CELLS)
                 at = ti.floor(x, ti.i32)
                 if any(at != place):  # a run of points in one cell costs one write
                     if run > 0:
@@ -65,7 +65,7 @@ def bin_points(
                 run += count
                 weight = ti.cast(count, ti.f32)
                 for i, values in ti.static(enumerate((values_0, values_1, values_2))):
-                    scaled = weight * scales[i]
+                    scaled = weight * scales[1 + i]
                     for c in ti.static(range(channels[i])):
                         total[ti.static(sum(channels[:i])) + c] += values[n, c] * scaled
                 if ti.static(with_positions):

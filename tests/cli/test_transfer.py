@@ -172,7 +172,9 @@ def test_networks_run_and_a_property_that_no_frame_gives_costs_nothing_else(
     assert "gives 100% NaN or infinite values" in said and "Traceback" not in said
     assert (out / "mesh.ply").exists() and not (out / "style.ply").exists()
     values = read_mesh(out / "saliency.ply").attributes["saliency"]
-    assert values.min() > -0.2 and 0.05 < values.max() < 1.2
+    # a field goes beyond what it was given where the surface ends
+    low, high = np.percentile(values, (1, 99))
+    assert low > -0.1 and 0.05 < high < 1.1 and values.min() > -0.5 and values.max() < 1.5
 
 
 @pytest.mark.parametrize(

@@ -105,9 +105,9 @@ class Blocks:
         for n, cloud in enumerate(clouds):
             found, points, counts, normals = in_runs(cloud)
             nothing, channels, index = [points] * 2, (3, 0, 0), self.grid.index
-            scales = binning.Scales([scale, 1.0, 1.0])
+            scales = binning.Scales([1 / VS, scale, 1.0, 1.0])
             binning.bin_points(
-                found, SLOTS, points, counts, normals, *nothing, channels, scales, 1 / VS,
+                found, SLOTS, points, counts, normals, *nothing, channels, scales,
                 int(np.int32(np.uint32(1 << n))), with_positions, index, self.keys, sums,
             )  # fmt: skip
         return sums
