@@ -1,7 +1,11 @@
-"""A box in a scene: what lies in it, how large that is, and a file of just that part."""
+"""A box in a scene: what lies in it, how large that is, and a file of just that part.
+
+Boxes stand upright: their corners are given in the frame `up`, whose z points up.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,17 +42,22 @@ class BoxMeasure:
         )
 
 
-def measure_box(meshes: list[SceneMesh], corners: NDArray) -> BoxMeasure:
-    """What lies in a box (2, 3) scene [m]: triangles with all corners inside."""
+def measure_box(meshes: Sequence[SceneMesh], corners: NDArray, T_up_scene: NDArray) -> BoxMeasure:
+    """What lies in a box (2, 3) up [m]: triangles with all corners inside."""
     size = np.maximum(corners[1] - corners[0], 0)
-    parts = [shown.part(inside_box(shown.mesh.vertices, corners)).mesh for shown in meshes]
+    parts = [_inside(shown, corners, T_up_scene).mesh for shown in meshes]
     area = sum(float(areas(part.vertices, part.faces).sum()) for part in parts)
     return BoxMeasure(size, float(size.prod()), area, sum(len(part.faces) for part in parts))
 
 
-def inside_box(points: NDArray, corners: NDArray) -> NDArray[np.bool_]:
-    """Which points (N, 3) lie in a box (2, 3)."""
-    return ((points >= corners[0]) & (points <= corners[1])).all(axis=1)
+def upright(points: NDArray, T_up_scene: NDArray) -> NDArray[np.float64]:
+    """Points (N, 3) of the scene in the frame `up`."""
+    return np.asarray(points, np.float64) @ T_up_scene[:3, :3].T + T_up_scene[:3, 3]
+
+
+def _inside(shown: SceneMesh, corners: NDArray, T_up_scene: NDArray) -> SceneMesh:
+    points = upright(shown.mesh.vertices, T_up_scene)
+    return shown.part(((points >= corners[0]) & (points <= corners[1])).all(axis=1))
 
 
 def box_around(points: NDArray) -> NDArray[np.float64] | None:
@@ -59,11 +68,11 @@ def box_around(points: NDArray) -> NDArray[np.float64] | None:
     return np.stack([low - MARGIN, high + MARGIN])
 
 
-def write_part(path: Path, shown: SceneMesh, corners: NDArray) -> Mesh:
-    """Write the triangles of a mesh inside a box (2, 3) scene [m], in the mesh's own world, with all
+def write_part(path: Path, shown: SceneMesh, corners: NDArray, T_up_scene: NDArray) -> Mesh:
+    """Write the triangles of a mesh inside a box (2, 3) up [m], in the mesh's own world, with all
     that its vertices carry; raises InputError where there is none, FileError.
     """
-    part = shown.part(inside_box(shown.mesh.vertices, corners)).mesh
+    part = _inside(shown, corners, T_up_scene).mesh
     if not len(part.faces):
         raise InputError("the box holds no triangle; draw it around some surface")
     vertices = (part.vertices - shown.offset).astype(np.float32)

@@ -9,10 +9,11 @@ import numpy as np
 
 from ..errors import UniFusionError
 from ..geometry.quaternions import quaternion_to_rotation
-from .parts import box_around, measure_box, rectangle_camera, write_part
+from .parts import box_around, measure_box, rectangle_camera, upright, write_part
 from .picking import Hit
 from .scene import Box, Label
 from .web_results import ShownResults
+from .web_stage import box_edges
 from .web_text import describe_hit, paragraph, table
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 MEASURED, PART = "measured", "part"  # groups of marks
-PART_COLOR = (40, 160, 90)
 STEP = 0.01  # [m] by which a corner is moved
 INVITATION = "Click on the surface; two clicks: a distance."
 
@@ -85,6 +85,7 @@ class PartPanel:
             )
         )
         points = np.concatenate([mesh.mesh.vertices for mesh in results.wholes])
+        points = upright(points, results.scene.T_up_world)
         low = np.floor(100 * points.min(axis=0)) / 100
         high = np.ceil(100 * points.max(axis=0)) / 100
         self.low = gui.add_vector3("From [m]", tuple(low.tolist()), step=STEP)
@@ -108,7 +109,8 @@ class PartPanel:
         T_world_camera[:3, :3] = _rotation(view.wxyz)
         T_world_camera[:3, 3] = view.position
         seen = self.results.stage.seen(camera, T_world_camera, mask)
-        corners = box_around(np.concatenate([np.zeros((0, 3)), *seen.values()]))
+        points = np.concatenate([np.zeros((0, 3)), *seen.values()])
+        corners = box_around(upright(points, self.results.scene.T_up_world))
         if corners is None:
             self.said.content = paragraph("There is no surface in the rectangle.")
             return
@@ -117,22 +119,25 @@ class PartPanel:
 
     @property
     def corners(self) -> np.ndarray:
-        """(2, 3) scene [m]."""
+        """(2, 3) [m] in the upright frame of the scene."""
         return np.array([self.low.value, self.high.value])
 
     def measure(self) -> None:
         """Draw the box, and say what lies in it."""
-        measured = measure_box(self.results.wholes, self.corners)
-        self.results.stage.mark(PART, boxes=[Box("part", self.corners, PART_COLOR)])
+        T_up_scene = self.results.scene.T_up_world
+        measured = measure_box(self.results.wholes, self.corners, T_up_scene)
+        edges = box_edges(Box("part", self.corners)).reshape(-1, 3)
+        edges = upright(edges, np.linalg.inv(T_up_scene)).reshape(-1, 2, 3)
+        self.results.stage.mark(PART, lines=edges)
         self.said.content = paragraph(measured.sentence)
 
     def write(self) -> None:
         """Write what lies in the box beside the results that it is of."""
-        written = []
+        written, T_up_scene = [], self.results.scene.T_up_world
         for whole, source in zip(self.results.wholes, self.results.sources, strict=True):
-            if measure_box([whole], self.corners).triangles:
+            if measure_box([whole], self.corners, T_up_scene).triangles:
                 path = source.next_part()
-                part = write_part(path, whole, self.corners)
+                part = write_part(path, whole, self.corners, T_up_scene)
                 written.append(f"{path}: {len(part.faces):,} triangles")
         if not written:
             self.said.content = paragraph("The box holds no triangle; draw it around some surface.")

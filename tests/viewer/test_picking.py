@@ -94,19 +94,28 @@ def test_a_rectangle_of_a_view_becomes_a_box_around_what_it_shows():
 
 def test_a_box_holds_its_share_of_the_surface():
     corners = np.array([[-0.01, -0.01, -0.5], [0.51, 0.31, 0.5]])
-    measured = measure_box([floor(), floor().moved(np.array([10.0, 0, 0]))], corners)
+    measured = measure_box([floor(), floor().moved(np.array([10.0, 0, 0]))], corners, np.eye(4))
     assert measured.area == pytest.approx(0.5 * 0.3, abs=EXACT)
     assert measured.volume == pytest.approx(0.52 * 0.32 * 1.0)
     assert measured.triangles == 5 * 3 * 2
 
 
+def test_boxes_stand_upright_whatever_the_world():
+    # up is the world's -y
+    T_up_scene = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    wall = floor()  # z = 0 of the world is a wall, from height 0 down to -1
+    corners = np.array([[-0.01, -0.1, -0.31], [0.51, 0.1, 0.01]])
+    measured = measure_box([wall], corners, T_up_scene)
+    assert measured.area == pytest.approx(0.5 * 0.3, abs=EXACT)
+
+
 def test_a_part_is_written_in_its_own_world_with_its_values(tmp_path):
     moved = floor().moved(np.array([10.0, 0, 0]))
     corners = np.array([[9.99, -0.01, -0.5], [10.51, 0.31, 0.5]])
-    write_part(tmp_path / "part.ply", moved, corners)
+    write_part(tmp_path / "part.ply", moved, corners, np.eye(4))
     part: Mesh = read_mesh(tmp_path / "part.ply")
     assert len(part.faces) == 5 * 3 * 2 and part.vertices[:, 0].max() <= 0.5 + EXACT
     assert np.allclose(part.attributes["across"][:, 0], part.vertices[:, 0], atol=EXACT)
     with pytest.raises(InputError, match="no triangle"):
-        write_part(tmp_path / "none.ply", moved, corners + 100)
+        write_part(tmp_path / "none.ply", moved, corners + 100, np.eye(4))
     assert not (tmp_path / "none.ply").exists()
