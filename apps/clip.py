@@ -10,11 +10,15 @@ import sys
 import taichi_unifusion as uf
 from taichi_unifusion.language import make_image_encoder, make_text_encoder
 from taichi_unifusion.language.questions import ask
+from taichi_unifusion.viewer.window_live import watch_in_window
 
 
 def main(format: str, path: str, model: str, *texts: str) -> None:
     pipeline = uf.Pipeline(uf.Config(), encoder=make_image_encoder(f"clip:{model}"))
-    pipeline.run(uf.open_dataset(format, path)[::10])
+    frames = uf.open_dataset(format, path)[::10]
+    watcher = watch_in_window(path, len(frames))  # where there is a screen
+    pipeline.run(frames, on_step=watcher.on_step, on_skip=watcher.on_skip)
+    watcher.close()
     for answer in ask(
         pipeline.maps["features"],
         pipeline.extract_mesh(),

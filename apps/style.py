@@ -9,6 +9,7 @@ import sys
 
 import taichi_unifusion as uf
 from taichi_unifusion.results import write_results
+from taichi_unifusion.viewer.window_live import watch_in_window
 
 
 def main(format: str, path: str, out: str, network: str = "") -> None:
@@ -21,9 +22,12 @@ def main(format: str, path: str, out: str, network: str = "") -> None:
         )
     )
     pipeline = uf.Pipeline(uf.Config(properties=styles))
-    run = pipeline.run(uf.open_dataset(format, path)[::10])
+    frames = uf.open_dataset(format, path)[::10]
+    watcher = watch_in_window(out, len(frames))  # where there is a screen
+    run = pipeline.run(frames, on_step=watcher.on_step, on_skip=watcher.on_skip)
     results = write_results(out, pipeline, run)
     print(f"{out}: {', '.join(results.files)}")
+    watcher.finish(results.directory)  # until the window is closed
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from ..errors import InputError, MissingDependency
+from ..errors import InputError
 from .options import EncoderOptions
 from .results_source import results_source
 
@@ -18,9 +17,6 @@ if TYPE_CHECKING:
     from ..viewer.null import Watcher
     from ..viewer.source import ResultsSource
     from ..viewer.web import WebViewer
-
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,9 @@ def open_watcher(
     if options.view and options.view_window:
         raise InputError("view and view-window: choose one of them")
     if options.view_window:
-        return _open_window(title, frames, stop)
+        from ..viewer.window_live import watch_in_window
+
+        return watch_in_window(title, frames, stop)
     if not options.view:
         from ..viewer.null import NullViewer
 
@@ -78,17 +76,3 @@ def open_watcher(
         return results_source(path, SceneOptions(), EncoderOptions())
 
     return WebLive(viewer, frames, stop, open_results)
-
-
-def _open_window(title: str, frames: int, stop: Callable[[], bool]) -> Watcher:
-    """A window that watches a run; where there can be none, nothing does, and that is said."""
-    from ..viewer.null import NullViewer
-
-    try:
-        from ..viewer.window import SceneWindow
-        from ..viewer.window_live import WindowLive
-
-        return WindowLive(SceneWindow(title), frames, stop)
-    except MissingDependency as error:
-        logger.warning("%s; the run goes on without it", error)
-        return NullViewer()

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import UniFusionError
+from ..errors import MissingDependency, UniFusionError
 from ..geometry.gravity import Up
 from ..pipeline import Pipeline
 from ..run_log import SkippedFrame, StepResult
 from ..types import Frame, Mesh
 from .live import ABOVE, BACK, Block, ChangedChunks, Pace, upright
+from .null import NullViewer, Watcher
 from .orbit import Orbit
 from .results_scene import layers_of
 from .scene import Scene, SceneCamera, SceneMesh
@@ -138,6 +139,17 @@ class WindowLive:
         self.window.canvas.lines.put(
             np.array(lines, np.float32), np.tile(np.array(RED, np.float32), (len(lines), 1))
         )
+
+
+def watch_in_window(title: str, frames: int, stop: Callable[[], bool] = lambda: False) -> Watcher:
+    """A window that watches a run of so many frames; where there can be none, nothing does, and
+    that is said.
+    """
+    try:
+        return WindowLive(SceneWindow(title), frames, stop)
+    except MissingDependency as error:
+        logger.warning("%s; the run goes on without it", error)
+        return NullViewer()
 
 
 def joined(meshes: list[Mesh]) -> Mesh | None:

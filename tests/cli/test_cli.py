@@ -715,6 +715,8 @@ def test_info_on_what_is_not_ours_is_one_sentence(tmp_path, capsys, name, conten
 
 
 def test_the_app_goes_through_the_same_pipeline(recording, tmp_path, monkeypatch, capsys):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):  # or a window would wait for somebody
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "argv", ["reconstruct.py", "folder", str(recording), str(tmp_path)])
     runpy.run_path(str(ROOT / "apps" / "reconstruct.py"), run_name="__main__")
     assert "3 frames used, 0 skipped" in capsys.readouterr().out

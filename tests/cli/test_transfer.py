@@ -337,7 +337,9 @@ def test_a_function_that_fails_ends_the_run_and_keeps_what_was_done(frames, monk
         ("style", ["painting.png", "sketch.png"]),
     ],
 )
-def test_apps_run(recording, tmp_path, app, files):
+def test_apps_run(recording, tmp_path, monkeypatch, app, files):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):  # or a window would wait for somebody
+        monkeypatch.delenv(name, raising=False)
     runpy.run_path(str(ROOT / "apps" / f"{app}.py"))["main"](
         "folder", str(recording), str(tmp_path / "out")
     )
