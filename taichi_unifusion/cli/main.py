@@ -23,7 +23,7 @@ from tyro.conf import subcommand
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from ..config import Config, load_config
-from ..errors import FileError, UniFusionError
+from ..errors import FileError, UniFusionError, check_choice
 from .config import ShowConfig, show_config
 from .evaluate import METRICS, Evaluate
 from .export import Export, export
@@ -106,7 +106,9 @@ def _dispatch(argv: list[str]) -> int:
 
 def _run(prog: str, description: str, commands: Commands, argv: list[str]) -> int:
     name, arguments = (argv[0], argv[1:]) if argv and argv[0] in commands else (None, argv)
-    if name is None:  # help, or an unknown command: tyro prints what there is
+    if name is None and arguments and not {arguments[0][:1], *arguments} & {"-", "--help"}:
+        check_choice("command", arguments[0], commands)
+    if name is None:  # help, or no command: tyro prints what there is
         _say_commands(prog, description, commands, arguments)
         return FAILED
     options, command = commands[name]

@@ -272,7 +272,7 @@ def _import_torch():
         import transformers  # pyright: ignore[reportMissingImports]  # optional
     except (ImportError, OSError) as error:
         raise MissingDependency(
-            f"CLIP is run by transformers and torch: pip install torch transformers ({error})"
+            f"CLIP is run by transformers and torch: pip install 'taichi-unifusion[clip]' ({error})"
         ) from None
     transformers.logging.set_verbosity_error()
     transformers.logging.disable_progress_bar()

@@ -113,11 +113,9 @@ def files_in(folder: Path) -> list[str]:
             ],
         ),
         (
-            ["reconstrukt"],
+            ["reconstrukt", "7scenes", "x", "--out", "o"],
             2,
-            [
-                "reconstruct, transfer, understand, query, segment, view, render, mesh, export, info, config"
-            ],
+            ["command: 'reconstrukt' is unknown, did you mean 'reconstruct'?"],
         ),
         (
             ["reconstruct", "7scene", "x", "--out", "o"],
