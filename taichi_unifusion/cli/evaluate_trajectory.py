@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from ..types import Trajectory
 
 
+SAME = 1e-3  # [cm] what rounding in files makes of equal poses, and more
+
+
 @dataclass(frozen=True)
 class EvaluateTrajectory:
     """Compare estimated camera poses with true ones: ATE after alignment, RPE.
@@ -83,6 +86,12 @@ def evaluate_trajectory(options: EvaluateTrajectory) -> int:
         notes += f" Scale: {result.scale:.4f}."
     if not result.unique:
         notes += "\nThe positions lie on a line or in one point: ATE is right, but the alignment is one of many."
+    unaligned = result.ate_unaligned_cm
+    if options.ground_truth is None and unaligned is not None and unaligned.max < SAME:
+        notes += (
+            "\nThe run took the recording's poses as they are, so they are compared with themselves; "
+            "--tracking rgbd finds poses of its own."
+        )
     about = {
         "metric": "trajectory",
         "estimate": options.estimate,

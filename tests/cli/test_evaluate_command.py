@@ -406,6 +406,7 @@ def test_trajectory_table(results, capsys):
         "ATE, aligned [cm]" in out
         and "RPE, translation over 99 metres [cm]" in out
         and "3 of 3 estimated poses" in out
+        and "they are compared with themselves" in out
     )
 
 
