@@ -28,11 +28,10 @@ class AskPanel:
     def __init__(self, results: ShownResults, show_layer: Callable[[str], None]) -> None:
         """`show_layer` chooses the layer of an answer."""
         self.results, self.show_layer, gui = results, show_layer, results.viewer.server.gui
-        with gui.add_form(None) as form:
-            self.text = gui.add_text("Where is", "", hint="Enter asks")
-            button = gui.add_button("Ask")
-        button.on_click(lambda _: form.submit())
-        form.on_submit(
+        # of several lines, since a form drops letters that were typed just before Enter
+        self.text = gui.add_text("Where is", "", hint="Enter asks", multiline=True)
+        self.text.on_update(lambda event: self._typed(event.client))
+        gui.add_button("Ask").on_click(
             lambda event: results.viewer.request(lambda: self.ask(event.client), event.client)
         )
         self.said = gui.add_html("")
@@ -43,6 +42,12 @@ class AskPanel:
         """Ask as the user of the page would."""
         self.text.value = text
         self.ask()
+
+    def _typed(self, client: viser.ClientHandle | None) -> None:
+        """Ask once Enter has been pressed, which ends the line."""
+        if "\n" in self.text.value:
+            self.text.value = self.text.value.replace("\n", "")
+            self.results.viewer.request(lambda: self.ask(client), client)
 
     def ask(self, client: viser.ClientHandle | None = None) -> None:
         """Ask all results that can be asked, and show what they answer."""

@@ -101,7 +101,9 @@ def control(browser: Any, label: str) -> Any:
     """The input of the control with that label."""
     from selenium.webdriver.common.by import By
 
-    return browser.find_element(By.XPATH, f"//label[contains(., '{label}')]/following::input[1]")
+    return browser.find_element(
+        By.XPATH, f"//label[contains(., '{label}')]/following::*[self::input or self::textarea][1]"
+    )
 
 
 def text_of(browser: Any) -> str:
@@ -144,6 +146,18 @@ def test_a_question_is_asked_by_enter_and_not_while_typing(shown, page):
     until(lambda: "place" in page.ask.said.content, "an answer", page.viewer.poll)
     until(lambda: "1. score" in text_of(shown), "the list of answers", page.viewer.poll)
     assert page.stage.layer == "query: red"
+
+
+def test_whoever_types_fast_is_asked_for_all_of_it(shown, page):
+    from selenium.webdriver.common.keys import Keys
+
+    box = control(shown, "Where is")
+    for before, word in (("red", "blue"), ("blue", "red")):
+        box.send_keys(*[Keys.BACKSPACE] * len(before), word, Keys.ENTER)
+        asked = f"query: {word}"
+        until(lambda asked=asked: page.stage.layer == asked, "an answer", page.viewer.poll)
+        assert page.ask.text.value == word
+    until(lambda: "1. score" in text_of(shown), "the list of answers", page.viewer.poll)
 
 
 def test_a_row_of_the_answer_flies_there(shown, page):
