@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .errors import FrameError, InputError, PoseError, SizeMismatch
 from .geometry.camera import PinholeCamera
+from .geometry.triangles import used_vertices
 
 # |R^T R - I| and |det R - 1|: text files of 6 digits pass, a scale of 0.1 % does not
 RIGID_TOLERANCE = 1e-3
@@ -319,6 +320,13 @@ class Mesh:
             self,
             attributes={**self.attributes, name: values[:, None] if values.ndim == 1 else values},
         )
+
+    def part(self, kept: NDArray[np.bool_]) -> tuple[Mesh, NDArray[np.intp]]:
+        """The faces that are kept (F,) with their vertices, and which of this mesh's these are."""
+        rows, faces = used_vertices(self.faces[kept])
+        normals = None if self.normals is None else self.normals[rows]
+        attributes = {name: values[rows] for name, values in self.attributes.items()}
+        return Mesh(self.vertices[rows], faces, normals, attributes), rows
 
     def transformed(self, T_b_a: NDArray) -> Mesh:
         """This mesh of frame a in frame b, by a rigid transform (4, 4); without normals."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from meshes import scattered
 
 from taichi_unifusion import Frame, PinholeCamera, PointCloud
 from taichi_unifusion.errors import InputError, PoseError
@@ -84,3 +85,18 @@ def test_numbers_stand_in_for_time_stamps_that_are_missing():
     assert Trajectory.of([0.5, 0.75], [3, 4], poses).timestamps.tolist() == [0.5, 0.75]
     assert Trajectory.of([0.5, None], [3, 4], poses).timestamps.tolist() == [3, 4]
     assert len(Trajectory.of([], [], [])) == 0
+
+
+def test_a_part_of_a_mesh_has_its_faces_and_the_vertices_of_these():
+    mesh = scattered(color=3)
+    kept = np.arange(len(mesh.faces)) % 3 == 0
+    part, rows = mesh.part(kept)
+    assert len(rows) == 3 * kept.sum() and (np.diff(rows) > 0).all()
+    np.testing.assert_array_equal(part.vertices[part.faces], mesh.vertices[mesh.faces[kept]])
+    for mine, whole in (
+        (part.normals, mesh.normals),
+        (part.attributes["color"], mesh.attributes["color"]),
+    ):
+        np.testing.assert_array_equal(mine, whole[rows])
+    nothing, _ = mesh.part(np.zeros(len(mesh.faces), bool))
+    assert nothing.vertices.shape == nothing.faces.shape == (0, 3)

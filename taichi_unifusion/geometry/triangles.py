@@ -18,6 +18,12 @@ FACE_CHUNK = 32_768  # areas computed at once: intermediate numbers stay in the 
 POINT_CHUNK = 5_000  # points measured at once: some 150 MB of intermediate numbers at most
 
 
+def used_vertices(faces: NDArray) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """The vertices (V',) that faces (F, 3) have, in order, and the faces numbered by these."""
+    rows, numbered = np.unique(faces, return_inverse=True)
+    return rows.astype(np.intp, copy=False), numbered.reshape(-1, 3).astype(np.int32)
+
+
 def area_vectors(vertices: NDArray, faces: NDArray) -> NDArray[np.floating]:
     """Half the cross product of two edges, (F, 3), in the precision of the vertices (V, 3): as long
     as the triangle's area [m^2], towards the side from which its corners (F, 3) run

@@ -17,7 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, MissingDependency
-from ..geometry.triangles import SurfaceDistance, areas, sample_surface, vertex_normals
+from ..geometry.triangles import (
+    SurfaceDistance,
+    areas,
+    sample_surface,
+    used_vertices,
+    vertex_normals,
+)
 from ..types import Mesh
 from .mesh_checks import check_mesh
 
@@ -82,9 +88,8 @@ def simplify(mesh: Mesh, triangles: int) -> Mesh:
     faces = faces[areas(vertices, faces) > MIN_AREA]
     if not len(faces):
         raise InputError(f"simplify: nothing is left of the mesh at {triangles} triangles")
-    used, faces = np.unique(faces, return_inverse=True)
+    used, faces = used_vertices(faces)
     vertices = vertices[used].astype(np.float32)
-    faces = faces.reshape(-1, 3).astype(np.int32)
     return Mesh(vertices, faces, vertex_normals(vertices, faces))
 
 

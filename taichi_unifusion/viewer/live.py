@@ -103,17 +103,9 @@ def split_blocks(mesh: Mesh, blocks: NDArray[np.int32], voxel_size: float) -> Ma
     """
     centers = mesh.vertices[mesh.faces].mean(axis=1)
     owner = np.floor(np.floor(centers / voxel_size + 0.5) / MESH_BLOCK).astype(np.int64)
-    return {block: _part(mesh, (owner == np.array(block)).all(axis=1)) for block in _tuples(blocks)}
-
-
-def _part(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
-    rows, faces = np.unique(mesh.faces[kept], return_inverse=True)
-    return Mesh(
-        mesh.vertices[rows],
-        faces.reshape(-1, 3).astype(np.int32),
-        None if mesh.normals is None else mesh.normals[rows],
-        {name: values[rows] for name, values in mesh.attributes.items()},
-    )
+    return {
+        block: mesh.part((owner == np.array(block)).all(axis=1))[0] for block in _tuples(blocks)
+    }
 
 
 def _tuples(blocks: NDArray[np.int32]) -> list[Block]:

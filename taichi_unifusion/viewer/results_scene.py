@@ -18,6 +18,7 @@ from ..errors import FileError, InputError, UniFusionError
 from ..files.atomic import read_bytes
 from ..files.maps import read_map
 from ..files.mesh_reading import read_any_mesh, read_mesh
+from ..files.ply import color_to_uint8
 from ..files.trajectories import read_trajectory
 from ..geometry.triangles import SurfaceDistance
 from ..rendering.look import Look
@@ -98,7 +99,7 @@ def _own_layers(mesh: Mesh, looks: Mapping[str, Look]) -> Iterator[Layer]:
     """Colour, and every property that the mesh carries."""
     color = mesh.attributes.get(COLOR)
     if color is not None and color.shape[1] == 3:
-        yield Layer(COLOR, (255 * np.clip(np.nan_to_num(color), 0, 1) + 0.5).astype(np.uint8))
+        yield Layer(COLOR, color_to_uint8(color))
     else:
         yield Layer(COLOR, np.full((len(mesh.vertices), 3), GREY, np.uint8))
     for name, values in mesh.attributes.items():

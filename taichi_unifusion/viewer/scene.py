@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..files.ply import color_to_uint8
 from ..geometry.triangles import area_vectors, vertex_normals
 from ..rendering.look import Look, color_table, colorize, shown_range
 from ..types import Mesh, PinholeCamera, check_rigid
@@ -75,13 +76,13 @@ class Layer:
         if channels not in (1, 3):
             raise InputError(f"layer '{name}': {channels} channels have no colours, 1 and 3 have")
         low, high = shown_range(values, look)
-        colors = _bytes(colorize(values, look.colormap, low, high))
+        colors = color_to_uint8(colorize(values, look.colormap, low, high))
         colors[~np.isfinite(values).all(axis=1)] = UNKNOWN
         label = look.label or name
         if channels == 3:
             legend = Legend(f"{label}: red, green and blue", np.zeros((0, 3), np.uint8), low, high)
         else:
-            legend = Legend(label, _bytes(color_table(look.colormap)), low, high)
+            legend = Legend(label, color_to_uint8(color_table(look.colormap)), low, high)
         return cls(name, colors, values, legend)
 
     @classmethod
@@ -175,15 +176,7 @@ class SceneMesh:
 
     def part(self, inside: NDArray[np.bool_]) -> SceneMesh:
         """The triangles of which all corners are `inside` (V,), with their vertices."""
-        faces = self.mesh.faces[inside[self.mesh.faces].all(axis=1)]
-        rows, faces = np.unique(faces, return_inverse=True)
-        old = self.mesh
-        mesh = Mesh(
-            old.vertices[rows],
-            faces.reshape(-1, 3).astype(np.int32),
-            None if old.normals is None else old.normals[rows],
-            {name: values[rows] for name, values in old.attributes.items()},
-        )
+        mesh, rows = self.mesh.part(np.all(inside[self.mesh.faces], axis=1))
         return replace(self, mesh=mesh, layers=tuple(each.take(rows) for each in self.layers))
 
 
@@ -345,7 +338,3 @@ def _moved(scene: Scene, by: NDArray) -> Scene:
         boxes=tuple(replace(box, corners=box.corners + by) for box in scene.boxes),
         labels=tuple(replace(label, position=label.position + by) for label in scene.labels),
     )
-
-
-def _bytes(colors: NDArray) -> NDArray[np.uint8]:
-    return (255 * np.clip(colors, 0, 1) + 0.5).astype(np.uint8)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from ..errors import UniFusionError
+from ..files.ply import color_to_uint8
 from ..pipeline import Pipeline
 from ..run_log import SkippedFrame, StepResult
 from ..types import Frame, Mesh
@@ -181,7 +182,7 @@ def chunk_glb(mesh: Mesh) -> bytes:
     if color is None:
         layer = Layer("", np.full((count, 3), GREY, np.uint8), np.zeros((count, 1), np.float32))
     else:
-        layer = Layer("", (255 * np.clip(color, 0, 1) + 0.5).astype(np.uint8))
+        layer = Layer("", color_to_uint8(color))
     return glb_of(mesh, layer, np.ones(len(mesh.faces), bool))
 
 

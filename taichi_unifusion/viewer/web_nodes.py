@@ -121,9 +121,8 @@ def glb_of(mesh: Mesh, layer: Layer, kept: NDArray[np.bool_]) -> bytes:
     Colours of a recording hold its light and are shown as they are; those of values get light, so
     that shapes can be seen.
     """
-    rows, faces = np.unique(mesh.faces[kept], return_inverse=True)
-    normals = mesh.normals[rows] if layer.lit and mesh.normals is not None else None
-    part = Mesh(mesh.vertices[rows], faces.reshape(-1, 3).astype(np.int32), normals)
+    bare = Mesh(mesh.vertices, mesh.faces, mesh.normals if layer.lit else None)
+    part, rows = bare.part(kept)
     file = io.BytesIO()
     write_glb(file, part.with_attribute("color", layer.colors[rows] / 255), lit=layer.lit)
     return file.getvalue()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import MissingDependency
+from ..files.ply import color_to_uint8
 from ..geometry.triangles import area_vectors
 from ..rendering.drawing import BACKGROUND
 from .orbit import Orbit
@@ -141,7 +142,7 @@ class WindowCanvas:
         """
         buffer = self.window.get_image_buffer_as_numpy()  # (W, H, 4) from below
         rgb = buffer[..., :3].transpose(1, 0, 2)[::-1]
-        return np.ascontiguousarray(255 * np.clip(rgb, 0, 1) + 0.5).astype(np.uint8)
+        return np.ascontiguousarray(color_to_uint8(rgb))
 
     def close(self) -> None:
         """Take the window away."""

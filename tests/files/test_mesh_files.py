@@ -6,6 +6,7 @@ import os
 
 import numpy as np
 import pytest
+from meshes import scattered
 
 from taichi_unifusion.errors import FileError, InputError
 from taichi_unifusion.files.mesh_reading import read_mesh
@@ -17,19 +18,7 @@ COLOR_STEP = 0.5 / 255 + 1e-6  # half a step of 8 bits, and float32 rounding
 
 @pytest.fixture
 def mesh() -> Mesh:
-    rng = np.random.default_rng(0)
-    normals = rng.normal(size=(50, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Mesh(
-        rng.normal(size=(50, 3)).astype(np.float32),
-        rng.permutation(50)[:48].reshape(16, 3).astype(np.int32),
-        normals.astype(np.float32),
-        {
-            "color": rng.random((50, 3)).astype(np.float32),
-            "heat": rng.random((50, 1)).astype(np.float32),
-            "clip_0": rng.random((50, 4)).astype(np.float32),
-        },
-    )
+    return scattered(color=3, heat=1, clip_0=4)
 
 
 def assert_equal_meshes(a: Mesh, b: Mesh) -> None:

@@ -20,6 +20,21 @@ def mesh_of(vertices, faces, color=None) -> Mesh:
     )
 
 
+def scattered(**channels: int) -> Mesh:
+    """16 triangles without a common vertex, two vertices without any, random unit normals, and so
+    many random channels of each attribute.
+    """
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Mesh(
+        rng.normal(size=(50, 3)).astype(np.float32),
+        rng.permutation(50)[:48].reshape(16, 3).astype(np.int32),
+        normals.astype(np.float32),
+        {name: rng.random((50, c)).astype(np.float32) for name, c in channels.items()},
+    )
+
+
 def rectangle(low, high, z: float, color=None, steps: int = 1) -> Mesh:
     """2 steps^2 triangles that fill low..high, (x, y) each, at height z."""
     x, y = (np.linspace(a, b, steps + 1) for a, b in zip(low, high, strict=True))
