@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..geometry.triangles import areas
+from ..geometry.triangles import areas, used_vertices
 from ..kernels import marching_cubes as kernels
 from ..kernels import query
 from ..kernels.cells import CELLS
@@ -80,13 +80,9 @@ def extract_mesh(
     sums = np.zeros((len(vertices), 3), np.int32)
     if len(faces):
         kernels.sum_normals(vertices, faces, NORMAL_UNIT * (resolution / voxel_size) ** 2, sums)
-    normals = _unit(sums)
-    if wanted is not None:  # the cubes around a block were there for the normals on its border
-        faces = np.compress(wanted, faces, axis=0)
-        used = _used(faces, len(vertices))
-        normals = np.compress(used, normals, axis=0)
-        vertices, faces = _without_unused(vertices, faces)
-    return Mesh(vertices, faces, normals)
+    mesh = Mesh(vertices, faces, _unit(sums))
+    # the cubes around a block were there for the normals on its border
+    return mesh if wanted is None else mesh.part(wanted)[0]
 
 
 def mesh_blocks(keys: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -172,13 +168,8 @@ def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.i
 def _without_unused(
     vertices: NDArray[np.float32], faces: NDArray[np.int32]
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    used = _used(faces, len(vertices))
-    return np.compress(used, vertices, axis=0), _ranks(used).take(faces)
-
-
-def _used(faces: NDArray[np.int32], vertices: int) -> NDArray[np.bool_]:
-    """Which of so many vertices a face has."""
-    return np.bincount(faces.reshape(-1), minlength=vertices) > 0
+    rows, faces = used_vertices(faces)
+    return vertices.take(rows, axis=0), faces
 
 
 def _ranks(chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
