@@ -60,6 +60,12 @@ def rasterize(
     return tuple(x.reshape(shape) for x in (np.where(face < 0, 0, depth), face, margin, plane))
 
 
+def thin_out(depth: np.ndarray, thinned: int) -> np.ndarray:
+    """Every `thinned`-th pixel of a depth image (H, W), along both axes."""
+    rows, columns = (range(0, size, thinned) for size in depth.shape)
+    return np.array([[depth[v, u] for u in columns] for v in rows])
+
+
 def shade_pixels(
     vertices, normals, colors, faces, camera, T_world_camera, seen, depth, look, samples, thinned
 ):
