@@ -37,7 +37,7 @@ PUBLIC = {
         Results Run RunFolder RunRecord inspect read_record read_run write_results
     """,
     "taichi_unifusion.tracking": """
-        Mode PoseSource TRACKERS TrackedFrame Tracker TrackingResult TrackingSettings
+        CurrentPoses Mode PoseSource TRACKERS TrackedFrame Tracker TrackingResult TrackingSettings
         Verdict check_poses make_tracker track
     """,
 }

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Literal
 from ..errors import DatasetError, InputError, check_choice
 from ..preprocessing import PreprocessSettings
 from .base import (
+    CurrentPoses,
     PoseSource,
     TrackedFrame,
     Tracker,
@@ -40,6 +41,7 @@ TRACKERS: dict[Mode, tuple[str, str]] = {  # name -> module here, class
 
 __all__ = [
     "TRACKERS",
+    "CurrentPoses",
     "Mode",
     "PoseSource",
     "TrackedFrame",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, PoseError
+from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame, Trajectory
 
@@ -122,6 +123,56 @@ class TrackingResult:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class CurrentPoses:
+    """Where all frames so far are, as far as it is known now: keyframes have poses, and a frame
+    moves with its keyframe.
+
+    Poses may change (a loop), disappear (the frame is lost after all) and appear (a sub-map joins
+    the first); whenever one did, `version` has grown. Arrays are copies of the tracker's.
+    """
+
+    version: int
+    keyframes: NDArray[np.int64]  # (K,) places in the recording
+    T_world_keyframe: NDArray[np.float64]  # (K, 4, 4); of a sub-map apart: in its own world
+    joined: NDArray[np.bool_]  # (K,) False: in a sub-map that has not joined the first yet
+    frames: NDArray[np.int64]  # (F,) places in the recording, in the order in which they came
+    keyframe: NDArray[np.int64]  # (F,) row of `keyframes` that the frame moves with; -1: no pose
+    T_keyframe_camera: NDArray[np.float64]  # (F, 4, 4)
+
+    @classmethod
+    def fixed(cls, frames: Sequence[TrackedFrame]) -> Self:
+        """Of frames whose poses never change: each is a keyframe of its own."""
+        poses = [T for frame in frames if (T := frame.T_world_camera) is not None]
+        posed = np.array([frame.T_world_camera is not None for frame in frames], bool)
+        indices = np.array([frame.index for frame in frames], np.int64)
+        return cls(
+            0,
+            indices[posed],
+            np.array(poses, np.float64).reshape(-1, 4, 4),
+            np.ones(len(poses), bool),
+            indices,
+            np.where(posed, np.cumsum(posed) - 1, -1),
+            np.broadcast_to(np.eye(4), (len(frames), 4, 4)).copy(),
+        )
+
+    @property
+    def posed(self) -> NDArray[np.bool_]:
+        """(F,) whether a frame has a pose in the world."""
+        if not len(self.joined):
+            return np.zeros(len(self.frames), bool)
+        return (self.keyframe >= 0) & self.joined[self.keyframe]
+
+    @property
+    def T_world_camera(self) -> NDArray[np.float64]:
+        """(F, 4, 4) poses of the frames; NaN for those that have none."""
+        poses, posed = np.full((len(self.frames), 4, 4), np.nan), self.posed
+        poses[posed] = se3.normalized(
+            self.T_world_keyframe[self.keyframe[posed]] @ self.T_keyframe_camera[posed]
+        )
+        return poses
+
+
 @dataclass(frozen=True)
 class PoseSource:
     """Where poses come from that are not the recording's, and how they are joined to frames."""
@@ -152,7 +203,7 @@ class Tracker(ABC):
 
     @abstractmethod
     def track(self, frame: Frame) -> TrackedFrame:
-        """The pose as far as it is known now, for display; `finish` may still change it. Never
+        """The pose as far as it is known now; later frames and `finish` may still change it. Never
         raises for a bad frame.
         """
 
@@ -160,6 +211,21 @@ class Tracker(ABC):
         """Note a frame that could not be loaded."""
         verdict = Verdict.MISSING if isinstance(error, PoseError) else Verdict.UNREADABLE
         return TrackedFrame(index, verdict, message=str(error))
+
+    @property
+    def version(self) -> int:
+        """Grows whenever the pose of an earlier frame has changed, as `CurrentPoses.version`; cheap
+        to ask after every frame.
+        """
+        return 0
+
+    def current_poses(self) -> CurrentPoses:
+        """Where all frames so far are now; after `finish`, at their final poses.
+
+        A tracker that changes earlier poses overrides this and `version`; for others `finish` must
+        bear being asked early.
+        """
+        return CurrentPoses.fixed(self.finish().frames)
 
     @abstractmethod
     def finish(self) -> TrackingResult:

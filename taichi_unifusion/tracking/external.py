@@ -15,7 +15,15 @@ from ..geometry import se3
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from .base import PoseSource, TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
+from .base import (
+    CurrentPoses,
+    PoseSource,
+    TrackedFrame,
+    Tracker,
+    TrackingResult,
+    TrackingSettings,
+    Verdict,
+)
 from .trajectory_files import ExternalPoses, read_poses
 
 MAX_DIFFERENCE = 0.02  # [s] between a frame and its pose, as TUM's benchmark has it
@@ -102,6 +110,9 @@ class ExternalPoseTracker(Tracker):
     def skip(self, index: int, error: Exception) -> TrackedFrame:
         self.frames.append(super().skip(index, error))
         return self.frames[-1]
+
+    def current_poses(self) -> CurrentPoses:
+        return CurrentPoses.fixed(self.frames)  # `finish` would complain about none so far
 
     def finish(self) -> TrackingResult:
         if not any(frame.T_world_camera is not None for frame in self.frames) and self.frames:

@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from .base import PoseSource, TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
+from .base import (
+    CurrentPoses,
+    PoseSource,
+    TrackedFrame,
+    Tracker,
+    TrackingResult,
+    TrackingSettings,
+    Verdict,
+)
 from .external import ExternalPoseTracker
 from .given import GivenPoses
 from .odometry import KeyframeOdometry, PreparedFrame
@@ -84,6 +92,13 @@ class InternalTracker(Tracker):
     def skip(self, index: int, error: Exception) -> TrackedFrame:
         skipped = self.prior.skip(index, error)
         return self.odometry.give_up(index, None, skipped.verdict, skipped.message)
+
+    @property
+    def version(self) -> int:
+        return self.odometry.version
+
+    def current_poses(self) -> CurrentPoses:
+        return self.odometry.current_poses()
 
     def finish(self) -> TrackingResult:
         return self.odometry.result(self.prior.finish().details)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from .base import TrackedFrame, TrackingResult, TrackingSettings, Verdict
+from .base import CurrentPoses, TrackedFrame, TrackingResult, TrackingSettings, Verdict
 from .features import Features, extract_features
 from .keyframes import Keyframe, Keyframes
 from .loop_closure import find_loops, neighbor_edges
@@ -64,7 +64,9 @@ class Placement:
 class KeyframeOdometry:
     """Keyframes, the edges between them, and where every frame lies relative to one of them."""
 
-    def __init__(self, settings: TrackingSettings, preprocess: PreprocessSettings) -> None:
+    def __init__(
+        self, settings: TrackingSettings, preprocess: PreprocessSettings, version: int = 0
+    ) -> None:
         self.settings = settings
         self.depth_range = preprocess.depth_min, settings.depth_max
         self.keyframes = Keyframes()
@@ -73,6 +75,7 @@ class KeyframeOdometry:
         self.placements: list[Placement] = []
         self.reference = 0  # number of the keyframe that frames are aligned to
         self.optimizations = 0
+        self.version = version  # grows when the poses of earlier frames change
 
     def prepare(self, frame: Frame) -> PreparedFrame:
         """Build the frame's pyramid."""
@@ -135,6 +138,7 @@ class KeyframeOdometry:
             graph = optimize(self.keyframes.T_world_keyframe, self.edges, self.priors)
             self.keyframes.T_world_keyframe = list(graph.T_world_node)
             self.optimizations += 1
+            self.version += 1
 
     def is_far(self, registration: Registration) -> bool:
         """Whether a frame is so far from its keyframe that it becomes one itself."""
@@ -181,6 +185,20 @@ class KeyframeOdometry:
         tracked = TrackedFrame(index, verdict, None, timestamp, message=message)
         self.placements.append(Placement(tracked))
         return tracked
+
+    def current_poses(self) -> CurrentPoses:
+        """Keyframes as they are now, and every frame's place relative to its own."""
+        placements = self.placements
+        poses = [placement.T_keyframe_camera for placement in placements]
+        return CurrentPoses(
+            self.version,
+            np.array([keyframe.index for keyframe in self.keyframes.items], np.int64),
+            np.array(self.keyframes.T_world_keyframe, np.float64).reshape(-1, 4, 4),
+            np.ones(len(self.keyframes), bool),
+            np.array([placement.tracked.index for placement in placements], np.int64),
+            np.array([-1 if p.keyframe is None else p.keyframe for p in placements], np.int64),
+            np.array([np.eye(4) if T is None else T for T in poses]).reshape(-1, 4, 4),
+        )
 
     def result(self, details: Mapping[str, Any] | None = None) -> TrackingResult:
         """All frames with poses that follow from the optimised keyframes."""

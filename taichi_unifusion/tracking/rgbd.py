@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
-from .base import PoseSource, TrackedFrame, Tracker, TrackingResult, TrackingSettings, Verdict
+from .base import (
+    CurrentPoses,
+    PoseSource,
+    TrackedFrame,
+    Tracker,
+    TrackingResult,
+    TrackingSettings,
+    Verdict,
+)
 from .features import locate, most_similar
 from .loop_closure import believable
 from .odometry import FRAME_AGREEMENT, SURE_AGREEMENT, KeyframeOdometry, Placement, PreparedFrame
@@ -72,6 +80,13 @@ class RgbdTracker(Tracker):
         tracked = super().skip(index, error)
         return self.odometry.give_up(index, None, tracked.verdict, tracked.message)
 
+    @property
+    def version(self) -> int:
+        return self.odometry.version
+
+    def current_poses(self) -> CurrentPoses:
+        return self.odometry.current_poses()
+
     def finish(self) -> TrackingResult:
         return self.odometry.result()
 
@@ -82,7 +97,8 @@ class RgbdTracker(Tracker):
 
     def _restart(self, prepared: PreparedFrame) -> TrackedFrame:
         """Start over here: no frame could be aligned to the first keyframe; its frames become LOST."""
-        before, self.odometry = self.odometry, KeyframeOdometry(self.settings, self.preprocess)
+        before = self.odometry
+        self.odometry = KeyframeOdometry(self.settings, self.preprocess, before.version + 1)
         for placement in before.placements:
             lost = placement.tracked
             if placement.keyframe is not None:
@@ -159,7 +175,7 @@ class RgbdTracker(Tracker):
             odometry.link_keyframe(number, by_appearance=True)
             T_world_camera = odometry.keyframes.T_world_keyframe[number]
         self.T_world_camera = T_world_camera
-        return tracked
+        return replace(tracked, T_world_camera=T_world_camera)
 
     def _give_up(self, frame: Frame, problem: str) -> TrackedFrame:
         self.lost, self.motion = True, np.eye(4)
