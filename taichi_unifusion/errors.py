@@ -8,6 +8,7 @@ needs.
 from __future__ import annotations
 
 import difflib
+import re
 import reprlib
 import sys
 from collections.abc import Collection, Iterable
@@ -77,6 +78,27 @@ class MapCorrupt(FileError):
 
 class MissingDependency(UniFusionError, ImportError):
     """An optional package is needed; the message holds the command that installs it."""
+
+
+_NO_MEMORY = re.compile("out.of.memory|memory allocation .* failed|could not allocate", re.I)
+
+
+def as_known(error: Exception) -> Exception:
+    """The error as CapacityError where it says that memory has run out, as Python, NumPy and Taichi
+    each do in their own way; else as it is.
+    """
+    if isinstance(error, UniFusionError):
+        return error
+    if not isinstance(error, MemoryError) and not (
+        isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))
+    ):
+        return error
+    reason = " ".join(str(error).split())[:160] or "no more is to be had"
+    known = CapacityError(
+        f"memory has run out ({reason}): use larger voxels, fewer maps or smaller images, or a machine with more"
+    )
+    known.__cause__ = error
+    return known
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from . import runtime
 from .config import Config
 from .datasets.loading import load_ahead
-from .errors import FrameError, InputError, UniFusionError
+from .errors import FrameError, InputError, as_known
 from .kernels.patches import Patches
 from .language.source import FeatureSource
 from .maps import BaseMap, FeatureMap, Integration, PropertyMap, SurfaceMap
@@ -197,8 +197,8 @@ class Pipeline:
         `stop` is asked before every frame, `on_frame` told after it how many there were, `on_step`
         after each that was fused what it did, `on_skip` which one was not used and why: there a
         viewer can look at the maps. What ends a run
-        early is in the result, with all that was done until then; raises DatasetError only where
-        not one frame could be used.
+        early, an error of any kind too, is in the result, with all that was done until then; raises
+        it, or DatasetError, only where not one frame could be used.
         """
         log, failure, interrupted = RunLog(sequence), None, False
         for i, load in enumerate(load_ahead(sequence)):
@@ -215,13 +215,23 @@ class Pipeline:
             except tuple(SKIP_REASONS) as error:
                 on_skip(log.add_skipped(i, error))
                 failure = error if strict else None
-            except UniFusionError as error:
-                failure = error
+            except Exception as error:  # noqa: BLE001 - none may cost the frames before it
+                failure = self._ended_by(error)
             on_frame(i + 1, len(sequence))
             if failure:
                 break
-        log.add_flush(self._flush())
+        try:
+            log.add_flush(self._flush())
+        except Exception as error:  # noqa: BLE001
+            failure = failure or self._ended_by(error)
+            self.fusion.give_up()
         return log.result(interrupted, failure)
+
+    def _ended_by(self, error: Exception) -> Exception:
+        """The error that ends a run; what it kept from being fused is tried once more at the end."""
+        logger.debug("the run ended early", exc_info=error)
+        self.fusion.try_again()
+        return as_known(error)
 
     def extract_mesh(
         self,

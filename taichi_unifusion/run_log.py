@@ -67,7 +67,7 @@ class RunResult:
     warnings: tuple[str, ...]
     seconds: float
     interrupted: bool = False  # asked to stop before the last frame
-    failure: UniFusionError | None = None  # what else ended the run before the last frame
+    failure: Exception | None = None  # what else ended the run before the last frame
 
 
 class RunLog:
@@ -148,9 +148,12 @@ class RunLog:
         self.skipped.append(skipped)
         return skipped
 
-    def result(self, interrupted: bool, failure: UniFusionError | None) -> RunResult:
+    def result(self, interrupted: bool, failure: Exception | None) -> RunResult:
         if not self.steps and not interrupted:
             raise failure or DatasetError(self._nothing_used())
+        for error in (failure, failure and failure.__cause__):
+            if error is not None:
+                error.__traceback__ = None  # it would hold the maps as long as the result lives
         trajectory = Trajectory.of(
             [stamp for stamp, _ in self.poses],
             [step.index for step in self.steps],

@@ -23,7 +23,7 @@ from tyro.conf import subcommand
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from ..config import Config, load_config
-from ..errors import FileError, UniFusionError, check_choice
+from ..errors import FileError, UniFusionError, as_known, check_choice
 from .config import ShowConfig, show_config
 from .evaluate import METRICS, Evaluate
 from .export import Export, export
@@ -93,6 +93,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             if debug:
                 raise
             return report([FileError(f"output could not be written: {error.strerror or error}")])
+        except (MemoryError, RuntimeError) as error:
+            if debug or (known := as_known(error)) is error:
+                raise
+            return report([known])
 
 
 def _dispatch(argv: list[str]) -> int:

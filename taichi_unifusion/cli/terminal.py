@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-DONE, FAILED = 0, 2  # exit codes
+from ..errors import UniFusionError
+
+DONE, BUG, FAILED = 0, 1, 2  # exit codes
 LINE_INTERVAL = 10.0  # [s] between progress lines where there is no bar
 
 logger = logging.getLogger("taichi_unifusion")
@@ -49,9 +51,17 @@ def log_to_stderr(debug: bool = False) -> Iterator[None]:
 
 def report(errors: Sequence[Exception]) -> int:
     """Show errors, and return the exit code that they make."""
+    unforeseen = [error for error in errors if not isinstance(error, UniFusionError)]
     for error in errors:
-        logger.error("%s", error)
-    return FAILED if errors else DONE
+        if error in unforeseen:
+            logger.error(
+                "an error that nobody foresaw, %s: %s; please report it, with what UNIFUSION_DEBUG=1 shows",
+                type(error).__name__,
+                " ".join(str(error).split())[:300],
+            )
+        else:
+            logger.error("%s", error)
+    return BUG if unforeseen else FAILED if errors else DONE
 
 
 @contextmanager

@@ -250,6 +250,7 @@ class WindowFusion:
         self.size, self.keep = size, keep
         self.window: Window | None = None
         self.pieces: deque[Piece] = deque()
+        self._begun: Piece | None = None  # that was handed out, and is not done
         self._rehearsals: list[Piece] = []  # for the first frame that has something for a part
         self._maps: set[RegressionMap] = set()  # that wait
         self._index, self._stride = 0, 0  # of the last frame in its recording, and the usual step
@@ -322,13 +323,32 @@ class WindowFusion:
             yield self._rehearsals.pop(0)
         frames_left = frames or self.size - (len(self.window) if self.window else 0)
         for _ in range(-(-len(self.pieces) // max(frames_left, 1))):
-            yield self.pieces.popleft()
+            self._begun = self.pieces.popleft()
+            yield self._begun
+            self._begun = None
         self._release()
 
     def run(self, count: int) -> None:
         """Do the next `count` pieces."""
         for _ in range(count):
-            self.pieces.popleft().work()
+            piece = self.pieces.popleft()
+            try:
+                piece.work()
+            except Exception:
+                self._begun = piece
+                raise
+
+    def try_again(self) -> None:
+        """Let a piece that failed be the next to do; what it had done, it does again."""
+        if self._begun is not None:
+            self.pieces.appendleft(self._begun)
+            self._begun = None
+
+    def give_up(self) -> None:
+        """Drop the frames that wait to be fused: the maps stay as they are."""
+        self.pieces.clear()
+        self._begun = self.window = None
+        self._release()
 
     def flush(self) -> None:
         """Fuse all frames that were summed up."""
