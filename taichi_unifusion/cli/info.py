@@ -13,10 +13,10 @@ from .terminal import report
 
 @dataclass(frozen=True)
 class Info:
-    """Show what a results folder, a map file or a PLY mesh holds, and whether it is sound."""
+    """Show what a results folder, a map file or a mesh holds, and whether it is sound."""
 
     path: Annotated[Positional[Path], arg(metavar="DIR|FILE")]
-    """Results folder, map (.safetensors) or mesh (.ply)."""
+    """Results folder, map (.safetensors) or mesh (.ply, .glb, .obj)."""
 
 
 def info(options: Info) -> int:

@@ -15,6 +15,7 @@ from ..geometry.gravity import Up, parse_up
 from ..results.run_folder import RunFolder
 from ..results.tables import format_bytes
 from .options import Device, UpOption
+from .results_source import holds_folder
 from .terminal import report
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ class ExtractMesh:
     """Where to compute."""
 
 
+@holds_folder()
 def extract_mesh(options: ExtractMesh) -> int:
     """Saved maps -> mesh files, those of single properties included."""
     from ..files.atomic import check_writable

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+from tyro.constructors import PrimitiveConstructorSpec
 
 from ..config import Config
 from ..datasets import FORMATS, Dataset, format_options, open_dataset, parse_options
@@ -21,6 +22,21 @@ from .color_camera import AUTO, ColorChoice
 
 FORMAT_DEFAULT = "(default: the format's)"
 OPTIONAL = "(optional)"
+
+
+def _folder(words: list[str]) -> Path:
+    if not words[0]:  # an unset variable of a shell; as a path it would be the current folder
+        raise ValueError("the name of a folder is empty; write . for the current one")
+    return Path(words[0])
+
+
+FOLDER = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="DIR",
+    instance_from_str=_folder,
+    is_instance=lambda value: isinstance(value, Path),
+    str_from_instance=lambda path: [str(path)],
+)
 ONE_EACH = "(give it once for each)"
 
 Settings = Annotated[Config, arg(name="")]
@@ -93,10 +109,12 @@ class TrackingOptions:
 class OutputOptions:
     """Where the results of a run go, and what its settings begin with."""
 
-    out: Annotated[Path, arg(metavar="DIR")]
+    out: Annotated[Path, FOLDER]
     """Folder for the results; made where it does not exist. The results of an earlier run in it are
-    replaced once this one is done.
+    replaced once this one is done, which is said; other files stay.
     """
+    overwrite: FlagCreatePairsOff[bool] = False
+    """Replace files that stand in the way and that no run is known to have written."""
     config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
     """YAML file of settings that differ from the defaults; options given here count more."""
     json: FlagCreatePairsOff[bool] = False

@@ -12,6 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..results.tables import format_table
 from .options import TextOptions
+from .results_source import holds_folder
 from .terminal import report
 from .texts import make_encoder, templates_of
 
@@ -51,6 +52,7 @@ class Query:
     encoder: Annotated[TextOptions, arg(name="")] = field(default_factory=TextOptions)
 
 
+@holds_folder(shared=True)
 def query(options: Query) -> int:
     """Texts -> meshes, pictures and regions."""
     from ..errors import InputError
@@ -62,6 +64,7 @@ def query(options: Query) -> int:
     from ..files.atomic import check_writable, write_text
     from ..language.questions import ask
     from ..results.folder_writer import FolderWriter
+    from ..results.ownership import add_answers
     from ..results.run_folder import RunFolder
     from ..results.understood import read_understood
 
@@ -103,6 +106,9 @@ def query(options: Query) -> int:
     text = json.dumps(listed, indent=2)
     writer.write(folder.answers, lambda path: write_text(path, text + "\n"))
     print(text if options.encoder.json else "\n\n".join(_table(entry) for entry in listed))
+    writer.attempt(
+        f"{folder.record}: could not be updated", lambda: add_answers(folder, writer.written)
+    )
     return report(writer.failures)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,13 +25,14 @@ from .options import (
     open_recording,
     source_of,
 )
-from .terminal import frame_progress, report
+from .terminal import DONE, FAILED, frame_progress, report
 from .viewing import WatchOptions, open_watcher
 
 if TYPE_CHECKING:
     from ..networks.encoders import ImageEncoder
     from ..results import RunFolder
     from ..results.record import ColorRecord
+    from ..run_log import RunResult
     from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
@@ -68,16 +70,41 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     """
     check_poses(recording, options.poses.tracking, options.poses.trajectory)
     recording, color = given_color(recording, options.recording.color_camera)
-    from ..results.writer import prepare_results, remove_temporaries
+    from ..results.lock import lock_folder
+    from ..results.writer import prepare_results
 
     up = parse_up(options.output.up) if options.output.up else None
     folder = prepare_results(options.output.out)
-    if earlier := folder.earlier_run():
+    with lock_folder(folder):
+        _say_what_is_replaced(folder, options, encoder is not None)
+        return _fuse_watched(recording, color, options, folder, encoder, up)
+
+
+def _say_what_is_replaced(folder: RunFolder, options: Reconstruct, features: bool) -> None:
+    """Warn where the folder holds an earlier run; raises FileError where it holds what is no run's."""
+    from ..results.ownership import describe_earlier
+    from ..results.writer import check_free
+
+    if not options.output.overwrite:
+        check_free(folder, options.settings, features, options.poses.tracked)
+    if earlier := describe_earlier(folder):
         logger.warning(
             "%s holds %s: this run replaces it when it is done; another --out keeps it",
             folder.path,
             earlier,
         )
+
+
+def _fuse_watched(
+    recording: Dataset,
+    color: ColorRecord,
+    options: Reconstruct,
+    folder: RunFolder,
+    encoder: ImageEncoder | None,
+    up: Up | None,
+) -> int:
+    from ..results.writer import remove_temporaries
+
     frames = len(range(0, len(recording), options.recording.every))
     with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
         watcher = open_watcher(options.watch, folder.path.name, frames, stop)
@@ -147,7 +174,28 @@ def _fuse_and_write(
         else summarize(results.record, results.files, folder.path)
     )
     code = report([error for error in (run.failure, *results.failures) if error])
+    code = _report_missing(run, len(frames)) or code
     return INTERRUPTED if stop() else code
+
+
+def _report_missing(run: RunResult, frames: int) -> int:
+    """Say how many of the frames are not in the map; FAILED where these are most of those tried."""
+    missing = frames - len(run.steps)
+    if not missing:
+        return DONE
+    kinds = Counter(frame.reason for frame in run.skipped)
+    if not_reached := missing - len(run.skipped):
+        kinds["not reached"] = not_reached
+    reasons = ", ".join(f"{count} {reason}" for reason, count in kinds.most_common())
+    few = len(run.skipped) >= len(run.steps)
+    logger.log(
+        logging.ERROR if few else logging.WARNING,
+        "%d of %d frames are not in the map: %s",
+        missing,
+        frames,
+        reasons,
+    )
+    return FAILED if few else DONE
 
 
 def _track(
@@ -160,6 +208,7 @@ def _track(
     """
     from .. import runtime
     from ..files.trajectories import write_trajectory
+    from ..results.ownership import mark_unfinished, owned_files
     from ..tracking.sequence import write_tracking
 
     poses, settings = options.poses, options.settings
@@ -176,6 +225,7 @@ def _track(
             stop=stop,
             on_frame=on_frame,
         )
+    mark_unfinished(folder, owned_files(folder) | set(map(folder.relative, folder.tracking_files)))
     write_tracking(folder.tracking, posed.tracking)
     write_trajectory(folder.tracked_poses, posed.tracking.trajectory)
     return posed, {"mode": poses.tracking, **posed.tracking.details}

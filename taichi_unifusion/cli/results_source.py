@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from ..results.lock import lock_folder
+from ..results.run_folder import RunFolder
 from .options import EncoderOptions
 
 if TYPE_CHECKING:
@@ -13,6 +17,26 @@ if TYPE_CHECKING:
     from ..viewer.source import ResultsSource
 
 logger = logging.getLogger(__name__)
+
+Command = Callable[[Any], int]
+
+
+def holds_folder(*, shared: bool = False) -> Callable[[Command], Command]:
+    """Makes a command hold the results folder `options.dir` while it runs, unless it writes
+    elsewhere, into `options.out`; see `lock_folder`.
+    """
+
+    def holding(command: Command) -> Command:
+        @wraps(command)
+        def held(options: Any) -> int:
+            if getattr(options, "out", None) is not None or not options.dir.is_dir():
+                return command(options)
+            with lock_folder(RunFolder(options.dir), shared=shared):
+                return command(options)
+
+        return held
+
+    return holding
 
 
 def results_source(path: Path, scene: SceneOptions, encoder: EncoderOptions) -> ResultsSource:
@@ -32,7 +56,6 @@ def _can_encode(path: Path, text: str | None) -> bool:
     for the words.
     """
     from ..files.maps import read_manifest
-    from ..results.run_folder import RunFolder
 
     features = RunFolder(path).features
     if not features.exists():

@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 from ..errors import InputError
 from ..results.tables import format_table
 from .options import OPTIONAL, TextOptions
+from .results_source import holds_folder
 from .terminal import report
 from .texts import make_encoder, templates_of
 
@@ -44,6 +45,7 @@ class Segment:
     encoder: Annotated[TextOptions, arg(name="")] = field(default_factory=TextOptions)
 
 
+@holds_folder(shared=True)
 def segment(options: Segment) -> int:
     """Names -> labelled mesh, picture, scores."""
     names = read_labels_file(options.labels)
@@ -53,6 +55,7 @@ def segment(options: Segment) -> int:
     from ..language.pictures import label_colors, label_mesh, segmentation_picture
     from ..language.questions import segment as segment_points
     from ..results.folder_writer import FolderWriter
+    from ..results.ownership import add_answers
     from ..results.run_folder import RunFolder
     from ..results.understood import read_understood
 
@@ -85,6 +88,9 @@ def segment(options: Segment) -> int:
     text = json.dumps(summary, indent=2)
     writer.write(folder.segmentation, lambda path: write_text(path, text + "\n"))
     print(text if options.encoder.json else _tables(summary, writer.files))
+    writer.attempt(
+        f"{folder.record}: could not be updated", lambda: add_answers(folder, writer.written)
+    )
     return report(writer.failures)
 
 

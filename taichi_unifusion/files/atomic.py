@@ -67,9 +67,10 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     On any exception, Ctrl-C included, the temporary file is removed and an older file at `path`
     stays as it was. An OSError of the block (disk full, no permission) becomes a FileError that
-    names `path` and the reason.
+    names `path` and the reason. A link keeps pointing where it does, and what it points to is
+    replaced; one that another user made is refused.
     """
-    path = Path(os.path.realpath(path))  # a link keeps pointing where it does
+    path = _followed(Path(path))
     if path.exists() and not path.is_file():
         raise FileError(f"{path}: cannot write: this is not a regular file; choose another name")
     temporary = path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}.tmp")
@@ -87,6 +88,15 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         # already renamed on success; never made if the folder does not exist
         with suppress(OSError):
             temporary.unlink()
+
+
+def _followed(path: Path) -> Path:
+    """Where a path leads; raises FileError where a link of another user says so: whoever may write
+    into a folder could choose which of our files is lost.
+    """
+    if path.is_symlink() and path.lstat().st_uid not in (os.geteuid(), 0):
+        raise FileError(f"{path}: cannot write: this is a link of another user; remove it first")
+    return Path(os.path.realpath(path))
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from ..maps import PropertyMap
 
 # names that files and attributes of a results folder already have
-RESERVED = ("surface", "color", "mesh", "preview", "normals", "features")
+RESERVED = ("surface", "color", "mesh", "preview", "normals", "features", "segmentation")
+RESERVED_BEGINNINGS = ("query-", "part-")
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,11 @@ class SurfaceProperty:
     settings: PropertySettings | None = None  # of its map; None: the configuration's `property_map`
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name) or self.name in RESERVED:
+        taken = self.name in RESERVED or self.name.startswith(RESERVED_BEGINNINGS)
+        if taken or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name):
             raise InputError(
                 f"property '{self.name}': a name has letters, digits, _ and -, and is none of "
-                f"{', '.join(RESERVED)}"
+                f"{', '.join(RESERVED)}, {', '.join(f'{beginning}*' for beginning in RESERVED_BEGINNINGS)}"
             )
         if self.channels < 1:
             raise InputError(

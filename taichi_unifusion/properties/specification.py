@@ -82,6 +82,13 @@ def make_property(text: str, settings: PropertySettings | None = None) -> Surfac
     return dataclasses.replace(made, name=options.get("name", name), settings=settings)
 
 
+def name_of(text: str) -> str:
+    """The name of the property that the text names, which nothing is made for; raises InputError."""
+    name, rest = [*re.split("[=,]", text, maxsplit=1), ""][:2]
+    methods = PROPERTIES.get(name)
+    return name if methods is None else _split(name, rest, methods)[2].get("name", name)
+
+
 def _split(name: str, rest: str, methods: dict) -> tuple[str, str, dict[str, str]]:
     """Method, file and options of what follows `NAME=`."""
     method, file, words = next(iter(methods)), "", rest.split(",") if rest else []

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from ..errors import FileError, InputError
+from ..errors import FileError, InputError, UniFusionError
+from .ownership import mark_unfinished, owned_files
 from .run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
@@ -23,6 +25,29 @@ class FolderWriter:
     folder: RunFolder
     written: list[Path] = field(default_factory=list)
     failures: list[Exception] = field(default_factory=list)
+    # names of files that runs wrote, this one's too, kept in a mark; None: nothing is marked
+    marked: set[str] | None = None
+
+    @classmethod
+    def marking(cls, folder: RunFolder, written: Sequence[Path] = ()) -> FolderWriter:
+        """A writer that marks the folder as unfinished, from now until a record is written.
+
+        `written` are files of this run that are there already.
+        """
+        owned = {*owned_files(folder), *map(folder.relative, written)}
+        writer = cls(folder, list(written), marked=owned)
+        writer.attempt(f"{folder.record}: could not be marked", writer.mark)
+        return writer
+
+    def mark(self) -> None:
+        """Keep in the mark what there is by now."""
+        mark_unfinished(self.folder, self.marked or ())
+
+    @property
+    def of_others(self) -> tuple[str, ...]:
+        """Files that earlier runs wrote, and this one did not write anew."""
+        names = sorted({*(self.marked or ())} - {*self.files, self.folder.record.name})
+        return tuple(name for name in names if (self.folder.path / name).exists())
 
     @property
     def files(self) -> list[str]:
@@ -36,6 +61,11 @@ class FolderWriter:
             write(file)
             return True
 
+        name = self.folder.relative(file)
+        if self.marked is not None and name not in self.marked:
+            self.marked.add(name)
+            with suppress(UniFusionError):  # said when the first mark could not be made
+                self.mark()
         if self.attempt(f"{file}: could not be written", action):
             self.written.append(file)
 
@@ -54,6 +84,8 @@ class FolderWriter:
 
     def remove(self, file: Path) -> None:
         """Remove a file of an earlier run that this run does not replace, so that results do not
-        mix.
+        mix; one that no run wrote stays.
         """
+        if self.folder.relative(file) not in (self.marked or owned_files(self.folder)):
+            return
         self.attempt(f"{file}: could not be removed", lambda: file.unlink(missing_ok=True))

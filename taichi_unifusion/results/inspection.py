@@ -9,7 +9,8 @@ from typing import TypeVar
 
 from ..errors import FileError, MapCorrupt, UniFusionError
 from ..files.maps import read_map
-from ..files.mesh_reading import read_mesh
+from ..files.mesh_reading import read_any_mesh
+from .lock import who_writes
 from .record import Source, read_record
 from .run_folder import RunFolder
 from .summary import count_frames, describe_up
@@ -17,6 +18,7 @@ from .tables import format_bytes, format_table
 
 T = TypeVar("T")
 
+MESHES = (".ply", ".glb", ".obj")
 MAP_COLUMNS = ["map", "kind", "voxels", "voxel size", "file", "encoder", "fusion", "version"]
 
 
@@ -29,8 +31,8 @@ class Inspection:
 
 
 def inspect(path: Path) -> Inspection:
-    """Describe a results folder, a map file or a PLY mesh; raises FileError where there is nothing
-    to describe.
+    """Describe a results folder, a map file or a mesh; raises FileError where there is nothing to
+    describe.
     """
     if path.is_dir():
         folder = RunFolder(path)
@@ -41,12 +43,8 @@ def inspect(path: Path) -> Inspection:
             )
     elif not path.exists():
         raise FileError(f"{path}: no such file or folder")
-    elif path.suffix.lower() == ".ply":
+    elif path.suffix.lower() in MESHES:
         maps, mesh, record = [], path, None
-    elif path.suffix.lower() in (".glb", ".obj"):
-        raise FileError(
-            f"{path}: of meshes only PLY is described; try {path.with_suffix('.ply').name}"
-        )
     else:
         maps, mesh, record = [path], None, None
     problems: list[UniFusionError] = []
@@ -64,6 +62,9 @@ def inspect(path: Path) -> Inspection:
         attempt(_describe_mesh, mesh),
         attempt(_describe_run, record),
     ]
+    if path.is_dir():
+        texts.append(_describe_writer(RunFolder(path)))
+        problems += _find_mixed(RunFolder(path))
     return Inspection("\n\n".join(text for text in texts if text), tuple(problems))
 
 
@@ -89,8 +90,41 @@ def _describe_map(file: Path) -> list[str]:
         ) from error
 
 
+def _describe_writer(folder: RunFolder) -> str | None:
+    """Who writes into the folder now, if somebody does."""
+    holder = who_writes(folder)
+    return None if holder is None else f"writing {holder}"
+
+
+def _find_mixed(folder: RunFolder) -> list[UniFusionError]:
+    """Files that are not those of the run that the record tells of."""
+    try:
+        record = read_record(folder.record)
+    except FileError:  # described already, or there is none
+        return []
+    there = {name: folder.path / name for name in record.files if folder.could_write(name)}
+    sizes = {name: file.stat().st_size for name, file in there.items() if file.is_file()}
+    changed = [name for name, size in sizes.items() if size != record.files[name]]
+    problems: list[UniFusionError] = [
+        FileError(
+            f"{folder.path / name}: holds {sizes[name]:,} bytes, not the {record.files[name]:,} that "
+            f"{folder.record.name} says: something else has written it since"
+        )
+        for name in changed
+    ]
+    if record.earlier_files:
+        problems.append(
+            FileError(
+                f"{folder.path}: {', '.join(record.earlier_files)} "
+                f"{'are' if len(record.earlier_files) > 1 else 'is'} of an earlier run, since this one could "
+                "not write all of its own"
+            )
+        )
+    return problems
+
+
 def _describe_mesh(file: Path) -> str:
-    mesh = read_mesh(file)
+    mesh = read_any_mesh(file)
     carries = ["normals"] * (mesh.normals is not None) + list(mesh.attributes)
     text = (
         f"mesh    {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, "

@@ -12,6 +12,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from ..errors import FileError, InputError, convert, shortened
 from ..files.atomic import read_bytes, write_text
 
+UNFINISHED = "unfinished"  # stands in a file that is there while a run writes
 SCHEMA_VERSION = 1  # files without a number are older, and are read as version 1
 
 
@@ -160,6 +161,8 @@ class RunRecord:
     views: tuple[ViewRecord, ...] = ()  # of preview.png and the pictures of properties
     peak_memory_bytes: int = 0
     files: Mapping[str, int] = field(default_factory=dict)  # sizes [bytes]
+    answers: tuple[str, ...] = ()  # files of questions asked since
+    earlier_files: tuple[str, ...] = ()  # of runs before, where this one could not write all
     warnings: tuple[str, ...] = ()
     errors: tuple[str, ...] = ()
     versions: Mapping[str, str]
@@ -201,6 +204,11 @@ def read_record(path: Path) -> RunRecord:
         values = json.loads(read_bytes(path))
     except (ValueError, RecursionError) as error:
         raise FileError(f"{path}: not the metrics of a run, or a damaged file ({error})") from None
+    if isinstance(values, dict) and values.get(UNFINISHED):
+        raise FileError(
+            f"{path}: the run that wrote here was ended before it was done, or still writes; files of an "
+            "earlier one may lie beside its own: run it again"
+        )
     try:
         return RunRecord.from_json(values)
     except InputError as error:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 MESH_SUFFIXES = ("ply", "glb", "obj")  # in the order in which meshes are written
 
@@ -136,6 +137,11 @@ class RunFolder:
         return self.path / f"part-{number}.ply"
 
     @property
+    def lock(self) -> Path:
+        """Says who writes into the folder now."""
+        return self.path / "run.lock"
+
+    @property
     def tracking_files(self) -> tuple[Path, ...]:
         """What a tracker leaves."""
         return self.tracking, self.tracked_poses
@@ -145,20 +151,38 @@ class RunFolder:
         """The files that exist of questions asked: they belong to the maps that were asked."""
         patterns = (self.answer_mesh("*"), self.answer_picture("*"))
         found = {file for pattern in patterns for file in self.path.glob(pattern.name)}
-        segmented = (self.segmentation, self.segmentation_mesh, self.segmentation_picture)
-        found |= {file for file in (self.answers, *segmented) if file.exists()}
+        found |= {file for file in (self.answers, *self.segmentation_files) if file.exists()}
         return tuple(sorted(found))
 
-    def earlier_run(self) -> str:
-        """What a further run would replace, in words; "" where there are neither maps nor a record."""
-        if not (self.maps or self.record.exists()):
-            return ""
-        held = [f"{'map' if len(self.maps) == 1 else 'maps'} {', '.join(self.maps)}"] * bool(
-            self.maps
-        )
-        held += ["a mesh"] * any(file.exists() for file in self.meshes)
-        held += ["answers"] * bool(self.asked)
-        return f"an earlier run ({'; '.join(held or ['no map'])})"
+    @property
+    def segmentation_files(self) -> tuple[Path, ...]:
+        """All that labelling leaves."""
+        return self.segmentation, self.segmentation_mesh, self.segmentation_picture
+
+    def run_files(self, maps: Iterable[str], formats: Iterable[str]) -> tuple[Path, ...]:
+        """What a run writes that makes these maps and meshes in these formats."""
+        maps, formats = tuple(maps), tuple(formats)
+        shown = [name for name in maps if name not in ("surface", "color", "features")]
+        files = [self.map(name) for name in maps] + [self.trajectory, self.config, self.record]
+        files.append(self.color_camera)
+        files += [self.mesh_file(suffix) for suffix in formats] + [self.preview]
+        for name in shown:
+            files += [self.property_mesh(name, suffix) for suffix in formats]
+            files.append(self.property_picture(name))
+        return tuple(files)
+
+    def could_write(self, name: str) -> bool:
+        """Whether a run or a question could have written a file of that name, relative to the
+        folder.
+        """
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts or "\0" in name or len(path.parts) > 2:
+            return False
+        if len(path.parts) == 2:
+            return self.path / path == self.map(path.stem)
+        fixed = (self.record, self.config, self.trajectory, self.color_camera, self.answers)
+        fixed = {file.name for file in (*fixed, *self.tracking_files, *self.segmentation_files)}
+        return name in fixed or path.suffix[1:] in (*MESH_SUFFIXES, "png")
 
     @property
     def temporaries(self) -> tuple[Path, ...]:

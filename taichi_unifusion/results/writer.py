@@ -8,21 +8,22 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
-from ..config import dump_config
+from ..config import Config, dump_config
 from ..datasets.color_camera import ColorCamera, write_color_camera
-from ..errors import InputError
+from ..errors import FileError, InputError
 from ..files.atomic import check_writable, write_text
 from ..files.images import write_png
 from ..files.meshes import write_mesh
 from ..files.trajectories import write_trajectory
 from ..geometry.gravity import Up
 from ..pipeline import Pipeline
+from ..properties.specification import name_of
 from ..rendering.legend import property_mesh
 from ..rendering.look import Look
 from ..rendering.preview import draw_views
@@ -31,6 +32,7 @@ from ..types import Mesh
 from .folder_writer import FolderWriter
 from .measure import first_frame_seconds, measure_run
 from .outlook import Outlook, look_at_mesh
+from .ownership import strangers
 from .property_files import looks_of, write_property_picture
 from .record import RunRecord, Seconds, Source, write_record
 from .run_folder import MESH_SUFFIXES, RunFolder
@@ -52,11 +54,26 @@ def prepare_results(directory: str | Path) -> RunFolder:
     """Make the folder; raises FileError if results cannot be written there, before any work is
     spent on them. A run that fails leaves no empty folder in it.
     """
+    if "\0" in str(directory):
+        raise FileError("the name of a results folder cannot hold a NUL character")
     folder = RunFolder(check_writable(directory))
     check_writable(folder.map_folder)
     with suppress(OSError):  # it holds maps
         folder.map_folder.rmdir()
     return folder
+
+
+def check_free(folder: RunFolder, config: Config, features: bool, tracked: bool) -> None:
+    """Raise FileError where files that no run wrote stand in the way of those that a run of this
+    configuration will write; with a map of features, with tables of a tracker.
+    """
+    names = ["surface", "color", *map(name_of, config.properties), *["features"] * features]
+    wanted = [*folder.run_files(names, config.mesh.formats), *folder.tracking_files * tracked]
+    if found := strangers(folder, wanted):
+        raise FileError(
+            f"{folder.path}: holds {' and '.join(found)}, which no run here is known to have written: choose "
+            "another folder, or replace what is there with --overwrite"
+        )
 
 
 def remove_temporaries(folder: RunFolder) -> None:
@@ -82,7 +99,7 @@ def write_results(
     """
     folder, started = prepare_results(directory), time.perf_counter()
     folder.map_folder.mkdir(exist_ok=True)
-    writer = FolderWriter(folder, list(written))
+    writer = FolderWriter.marking(folder, written)
     for file in folder.tracking_files:
         if file not in written:
             writer.remove(file)
@@ -101,7 +118,8 @@ def write_results(
         for name, look in looks_of(pipeline).items():
             _write_property(writer, mesh, name, look, pipeline, run, outlook)
     if not writer.failures:
-        _remove_others(writer, pipeline)
+        for name in writer.of_others:
+            writer.remove(folder.path / name)
     seconds = Seconds(
         frames=round(run.seconds, 3),
         first_frame=first_frame_seconds(run.steps),
@@ -110,6 +128,7 @@ def write_results(
     )
     record = measure_run(writer, pipeline, run, mesh, seconds, recording, tracking)
     record = record if outlook is None else outlook.kept_in(record)
+    record = replace(record, earlier_files=writer.of_others)
     writer.write(folder.record, lambda path: write_record(path, record))
     return Results(folder.path, tuple(writer.files), tuple(writer.failures), record)
 
@@ -164,18 +183,6 @@ def _write_color_camera(writer: FolderWriter, recording: Source | None) -> None:
 def _first_lacking(run: RunResult) -> dict[str, str]:
     """By name of a property, why the first frame that lacks it does not give it."""
     return {name: reason for step in reversed(run.steps) for name, reason in step.lacking.items()}
-
-
-def _remove_others(writer: FolderWriter, pipeline: Pipeline) -> None:
-    """Remove maps and properties of an earlier run in the folder, and answers that were asked of
-    it.
-    """
-    for name, file in writer.folder.maps.items():
-        if name not in pipeline.maps:
-            for other in (file, *writer.folder.property_files(name)):
-                writer.remove(other)
-    for file in writer.folder.asked:
-        writer.remove(file)
 
 
 def _write_mesh_files(

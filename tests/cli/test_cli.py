@@ -347,6 +347,9 @@ def test_F7_a_truncated_image_is_skipped_listed_and_the_run_ends_well(spoiled, t
     arguments = ["reconstruct", "folder", str(spoiled), *FLAGS, "--out", str(tmp_path / "out")]
     assert cli.main(arguments) == 0
     captured = capsys.readouterr()
+    assert captured.err.rstrip().splitlines()[-1] == (
+        "unifusion: warning: 1 of 3 frames are not in the map: 1 unreadable image"
+    )
     image = str(spoiled / "depth" / "1.png")
     assert (
         "2 used, 1 skipped" in captured.out
@@ -360,7 +363,11 @@ def test_F7_a_truncated_image_is_skipped_listed_and_the_run_ends_well(spoiled, t
 
     assert cli.main([*arguments, "--strict"]) == 2  # and the results so far are on disk
     captured = capsys.readouterr()
-    assert captured.err.rstrip().splitlines()[-1].startswith(f"unifusion: error: {image}")
+    ended, missing = captured.err.rstrip().splitlines()[-2:]
+    assert ended.startswith(f"unifusion: error: {image}")
+    assert missing == (
+        "unifusion: error: 2 of 3 frames are not in the map: 1 unreadable image, 1 not reached"
+    )
     assert "ended early after 2 of 3 frames" in captured.err
     assert files_in(tmp_path / "out") == OUTPUTS
     assert len(read_trajectory(tmp_path / "out" / "trajectory.txt")) == 1
@@ -413,12 +420,17 @@ def test_R6_a_folder_that_cannot_be_written_is_told_before_the_first_frame(
 def test_a_folder_that_is_used_again_holds_one_run(made, recording, tmp_path, capsys):
     """Maps, properties and answers of an earlier run go, which is said; other people's files stay."""
     out = shutil.copytree(made, tmp_path / "out")
-    shutil.copy(out / "maps" / "color.safetensors", out / "maps" / "style.safetensors")
-    old = ["style.ply", "style.png", "query-sofa.ply", "query.json", "segmentation.ply"]
-    for name in [*old, "notes.txt", "photo.png"]:
+    old = ["maps/style.safetensors", "style.ply", "style.png", "mesh.obj", "tracking.txt"]
+    answers = ["query-sofa.ply", "query-sofa.png", "query.json", "segmentation.ply"]
+    others = ["maps/my_llm.safetensors", "query-notes.png", "segmentation.md", "photo.png", "a.obj"]
+    for name in [*old, *answers, *others]:
         (out / name).write_text("of somebody")
+    record = json.loads((out / "metrics.json").read_text())
+    record |= {"files": record["files"] | dict.fromkeys(old, 11), "answers": answers}
+    (out / "metrics.json").write_text(json.dumps(record))
     assert cli.main(["reconstruct", "folder", str(recording), *FLAGS, "--out", str(out)]) == 0
-    assert files_in(out) == sorted([*OUTPUTS, "notes.txt", "photo.png"])
+    assert files_in(out) == sorted([*OUTPUTS, *others])
+    assert all((out / name).read_text() == "of somebody" for name in others)
     (said,) = (line for line in capsys.readouterr().err.splitlines() if "earlier run" in line)
     assert f"{out} holds an earlier run (maps color, style, surface; a mesh; answers)" in said
 

@@ -14,6 +14,7 @@ from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
 from taichi_unifusion.geometry import se3
+from taichi_unifusion.results.ownership import mark_unfinished
 from taichi_unifusion.results import RunFolder
 from taichi_unifusion.types import Trajectory
 
@@ -110,6 +111,7 @@ def test_results_of_tracking_do_not_outlive_it(found, tmp_path):
     earlier = RunFolder(tmp_path).tracking_files
     for file in earlier:
         file.write_text("of an earlier run")
+    mark_unfinished(RunFolder(tmp_path), [file.name for file in earlier])
     assert cli.main([*FEW, "--out", str(tmp_path)]) == 0
     assert not any(file.exists() for file in earlier)
 

@@ -1,0 +1,36 @@
+"""Where `unifusion` begins: Ctrl-C and SIGTERM are heard before anything heavy is imported, and do
+the same in every command.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from types import FrameType
+
+INTERRUPTED = 130  # exit code
+
+
+def main() -> int:
+    """Run the command line of this process and return its exit code."""
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:  # else somebody wants it ignored
+        signal.signal(signal.SIGTERM, _as_ctrl_c)
+    try:
+        from .main import main as run
+
+        code = run()
+    except KeyboardInterrupt:  # while modules were imported
+        os.write(2, b"unifusion: error: stopped\n")
+        code = INTERRUPTED
+
+    def end(number: int, frame: FrameType | None) -> None:
+        os._exit(code)
+
+    for number in (signal.SIGINT, signal.SIGTERM):  # all is written: nothing is left to stop
+        if callable(signal.getsignal(number)):
+            signal.signal(number, end)
+    return code
+
+
+def _as_ctrl_c(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

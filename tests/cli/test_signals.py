@@ -1,0 +1,104 @@
+"""Ctrl-C and SIGTERM at any moment of any command: exit code 130, nothing torn, nothing left."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from tiny_recording import CONFIG, DEVICE, make_frames
+
+from taichi_unifusion.files.mesh_reading import read_mesh
+from taichi_unifusion.pipeline import Pipeline
+from taichi_unifusion.results import write_results
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE = 120  # [s] for a process that has to start Taichi on a busy machine
+SIGNALS = [signal.SIGINT, signal.SIGTERM]
+START = """
+import sys, time
+def wait():
+    sys.stderr.write("now\\n")
+    sys.stderr.flush()
+    time.sleep(60)
+{}
+from taichi_unifusion.cli.start import main
+sys.exit(main())
+"""
+# each calls wait() at its moment
+IMPORTING = """
+class Slow:
+    def find_spec(self, name, path=None, target=None):
+        if name == "tyro":
+            wait()
+sys.meta_path.insert(0, Slow())
+"""
+AT_THE_END = "import atexit\natexit.register(wait)"
+WRITING = """
+from taichi_unifusion.files import atomic
+atomic._flush_to_disk = lambda path: wait()
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    pipeline = Pipeline(CONFIG)
+    out = tmp_path_factory.mktemp("results") / "made"
+    write_results(out, pipeline, pipeline.run(make_frames(1)))
+    return out
+
+
+def signalled(moment: str, number: signal.Signals, *arguments: str) -> tuple[int, str]:
+    """Exit code and stderr of a command that gets a signal at a moment."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", START.format(moment), *arguments],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    watchdog = threading.Timer(PATIENCE, process.kill)
+    watchdog.start()
+    try:
+        assert any(line == "now\n" for line in process.stderr)
+        process.send_signal(number)
+        said = process.stderr.read()
+        return process.wait(), said
+    finally:
+        watchdog.cancel()
+        process.kill()
+        process.stderr.close()
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize(
+    ("moment", "code"), [(IMPORTING, 130), (AT_THE_END, 0)], ids=["imports", "end"]
+)
+def test_R3_R4_signals_at_the_edges_are_no_traceback(number, moment, code):
+    ended, said = signalled(moment, number, "--version")
+    assert ended == code and said == ("unifusion: error: stopped\n" if code else "")
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_R3_R4_a_signal_while_mesh_writes_leaves_no_temporary_file(number, made, tmp_path):
+    out = shutil.copytree(made, tmp_path / "out")
+    before = sorted(path.name for path in out.iterdir())
+    code, said = signalled(WRITING, number, "mesh", str(out), "--device", DEVICE)
+    assert code == 130 and said.endswith("unifusion: error: stopped\n")
+    assert sorted(path.name for path in out.iterdir()) == before  # no .tmp, no lock
+    assert len(read_mesh(out / "mesh.ply").faces) > 0
+
+
+def test_R4_a_process_that_ignores_sigterm_goes_on_doing_so():
+    code = "import signal, subprocess, sys; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+    code += "from taichi_unifusion.cli import start, main as cli\n"
+    code += "cli.main = lambda: print(signal.getsignal(signal.SIGTERM) is signal.SIG_IGN) or 0\n"
+    code += "start.main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "True\n"
