@@ -14,8 +14,8 @@ from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
 from taichi_unifusion.geometry import se3
-from taichi_unifusion.results.ownership import mark_unfinished
 from taichi_unifusion.results import RunFolder
+from taichi_unifusion.results.ownership import mark_unfinished
 from taichi_unifusion.types import Trajectory
 
 FEW = ["reconstruct", "synthetic", "--end", "3", *FLAGS]

@@ -23,8 +23,8 @@ from taichi_unifusion.errors import InputError
 from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.properties import Look, SurfaceProperty
 from taichi_unifusion.rendering.legend import HEIGHT
-from taichi_unifusion.results.ownership import mark_unfinished
 from taichi_unifusion.results import RunFolder, write_results
+from taichi_unifusion.results.ownership import mark_unfinished
 
 CONSTANT = 1e-3  # a constant comes back everywhere where the map is valid, rims included
 DECIBELS = 1.0  # by which a property may be reproduced worse than colour, at equal voxel size
