@@ -14,7 +14,7 @@ import sys
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, SupportsFloat, Union, get_args, get_origin
 
 _LARGEST_INTEGER = 2**63  # what NumPy and files can hold
 _KINDS = {
@@ -108,6 +108,16 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
         shown = f"'{value[:80]}'" if isinstance(value, str) else shortened(value)
         raise InputError(
             f"{name}: {shown} is unknown{near}{';' if near else ','} choose one of {', '.join(choices)}"
+        )
+
+
+def check_range(name: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """Raise InputError unless a number lies in low..high; NaN does not."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, SupportsFloat)):
+        raise InputError(f"{name}: expected a number, got {shortened(value)}")
+    if not low <= float(value) <= high:
+        raise InputError(
+            f"{name}: must lie in {low:g}..{high:g}{f' {unit}' if unit else ''}, got {shortened(value)}"
         )
 
 

@@ -49,7 +49,6 @@ class ExtractMesh:
 def extract_mesh(options: ExtractMesh) -> int:
     """Saved maps -> mesh files, those of single properties included."""
     from ..files.atomic import check_writable
-    from ..files.maps import read_manifest
     from ..files.meshes import MESH_SUFFIXES, write_mesh
 
     up = parse_up(options.up) if options.up else None
@@ -68,13 +67,14 @@ def extract_mesh(options: ExtractMesh) -> int:
     check_writable(files[0].parent)
     from .. import pipeline, runtime
     from ..maps import PropertyMap, SurfaceMap
+    from ..maps.stored import read_description
 
     runtime.init(options.device)
     surface = SurfaceMap.load(maps.pop("surface"))
     properties = {
         name: PropertyMap.load(path)
         for name, path in maps.items()
-        if read_manifest(path)["kind"] == PropertyMap.kind  # others give vertices no value
+        if read_description(path).kind == PropertyMap.kind  # others give vertices no value
     }
     mesh = pipeline.extract_mesh(surface, properties, options.resolution, options.min_area)
     meshes = dict.fromkeys(files, mesh)

@@ -55,12 +55,14 @@ def _can_encode(path: Path, text: str | None) -> bool:
     """Whether questions can be put to a results folder: it holds features, and there is an encoder
     for the words.
     """
-    from ..files.maps import read_manifest
+    from ..maps.settings import FeatureSettings
+    from ..maps.stored import read_description
 
     features = RunFolder(path).features
     if not features.exists():
         return False
-    source = str(read_manifest(features)["settings"].get("source", ""))
+    settings = read_description(features).settings
+    source = settings.source if isinstance(settings, FeatureSettings) else ""
     if text is None and not source.startswith("clip:"):
         logger.info(
             "%s: holds features of %s; to ask, give the text encoder that belongs to them, with --text",

@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
@@ -27,6 +27,7 @@ from .atomic import atomic_write, file_error
 
 FORMAT = "taichi_unifusion LIM"
 FORMAT_VERSION = 1
+CONTAINER_KEYS = ("format", "format_version", "tensors")  # of the manifest
 MAX_HEADER = 64 << 20  # [bytes]; ours have a few thousand
 MAX_DIMENSIONS = 8
 # of one tensor, counting empty dimensions as 1, so that no product of sizes overflows
@@ -102,9 +103,11 @@ def write_map(
             file.write(_bytes_of(array))
 
 
-def read_map(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], dict[str, Any]]:
+def read_map(
+    path: str | os.PathLike[str], check: Callable[[dict[str, Any]], object] | None = None
+) -> tuple[dict[str, NDArray], dict[str, Any]]:
     """All arrays and the manifest (with the container's own keys, see `write_map`), each checked
-    against its sum.
+    against its sum; `check` is given the manifest before a tensor is read, and may raise.
 
     Raises FileError where the file is missing or cannot be read, MapCorrupt where it is truncated,
     altered, of another version or not ours; nothing is allocated that the file's size does not
@@ -112,6 +115,8 @@ def read_map(path: str | os.PathLike[str]) -> tuple[dict[str, NDArray], dict[str
     """
     with _open(path) as file:
         layout, manifest = _read_header(file, path)
+        if check is not None:
+            check(manifest)
         tensors = {}
         for name, (dtype, shape) in layout.items():
             array = np.empty(shape, dtype)

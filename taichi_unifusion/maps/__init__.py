@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
-from ..errors import MapCorrupt
-from ..files.maps import read_map
-
 if TYPE_CHECKING:
     from .base_map import BaseMap, Integration
     from .feature_map import FeatureMap
@@ -45,12 +42,12 @@ MAP_KINDS = {  # kind, as in files -> module here, class
 
 def load_map(path: str | Path) -> BaseMap:
     """The map in a file, of whatever kind it is; raises MapCorrupt or FileError."""
-    tensors, manifest = read_map(Path(path))
-    kind = manifest.get("kind")
-    if kind not in MAP_KINDS:
-        raise MapCorrupt(f"{path}: holds a map of kind '{kind}', not one of {', '.join(MAP_KINDS)}")
-    module, name = MAP_KINDS[kind]
-    return getattr(import_module(f".{module}", __name__), name).from_file(path, tensors, manifest)
+    from .stored import read_stored
+
+    description, data = read_stored(Path(path))
+    module, name = MAP_KINDS[description.kind]
+    kind = getattr(import_module(f".{module}", __name__), name)
+    return kind.restored(description, data)
 
 
 __getattr__, __dir__, _ = lazy_loader.attach(

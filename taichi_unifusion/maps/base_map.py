@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 from ..errors import InputError, MapCorrupt
-from ..files.maps import read_map, write_map
+from ..files.maps import write_map
 from ..types import Frame, PointCloud
-from .encoding import EncoderSettings
-from .settings import MapSettings
-from .voxel_grid import VoxelData, VoxelGrid
+from .settings import MapSettings, check_name
+from .stored import MapDescription, read_stored
+from .voxel_data import VoxelData
+from .voxel_grid import VoxelGrid
 
 S = TypeVar("S", bound=MapSettings)
 
@@ -44,6 +45,7 @@ class BaseMap(ABC, Generic[S]):
     settings_type: ClassVar[type[MapSettings]]
 
     def __init__(self, name: str, channels: int, settings: S, grid: VoxelGrid) -> None:
+        check_name("name of the map", name)
         self.name, self.channels, self.settings = name, channels, settings
         self.grid = grid
         self.waiting: Unfused | None = None
@@ -124,37 +126,19 @@ class BaseMap(ABC, Generic[S]):
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read a map of this kind written by `save`; raises MapCorrupt or FileError."""
-        tensors, manifest = read_map(Path(path))
-        if manifest.get("kind") != cls.kind:
-            raise MapCorrupt(
-                f"{path}: holds a map of kind '{manifest.get('kind')}', not '{cls.kind}'"
-            )
-        return cls.from_file(path, tensors, manifest)
+        description, data = read_stored(Path(path))
+        if description.kind != cls.kind:
+            raise MapCorrupt(f"{path}: holds a map of kind '{description.kind}', not '{cls.kind}'")
+        return cls.restored(description, data)
 
     @classmethod
-    def from_file(cls, path: str | Path, tensors: dict[str, Any], manifest: dict[str, Any]) -> Self:
-        """The map of a file's content; raises MapCorrupt where that does not fit."""
-        try:
-            values = dict(manifest["settings"])
-            settings = cls.settings_type(
-                **{**values, "encoder": EncoderSettings(**values["encoder"])}
-            )
-            restored = cls._empty(manifest["name"], int(manifest["channels"]), settings)
-        except (KeyError, TypeError, InputError) as error:
-            raise MapCorrupt(
-                f"{path}: its settings are not those of a map of this version of taichi_unifusion; "
-                "integrate the frames again"
-            ) from error
-        restored.grid.put(restored.grid.check(path, tensors))
-        return restored
+    def restored(cls, description: MapDescription, data: VoxelData) -> Self:
+        """The map that a file of this kind holds."""
+        made = cls._empty(description.name, description.channels, description.settings)
+        made.grid.put(data)
+        return made
 
     @classmethod
     @abstractmethod
     def _empty(cls, name: str, channels: int, settings: Any) -> Self:
         """An empty map as described by a file's manifest."""
-
-
-def check_channels(what: str, channels: int) -> None:
-    """Raise InputError for a map without channels; `what` names the map."""
-    if channels < 1:
-        raise InputError(f"{what}: channels must be at least 1, got {channels}")

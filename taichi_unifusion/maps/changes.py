@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from ..kernels.cells import BLOCK_CELLS
 from ..kernels.pools import copy_rows
 from .meshing import mesh_blocks
-from .pool import VoxelField
 from .surface_map import SurfaceMap
-from .voxel_grid import EVIDENCE, KEYS, MASKS, WEIGHTS, VoxelGrid
+from .voxel_data import EVIDENCE, KEYS, MASKS, WEIGHTS, VoxelField
+from .voxel_grid import VoxelGrid
 
 # A voxel is meshed again when its weight has grown by this share since: by Eq. 19 its latents have then
 # moved by at most a fifth of the way to what was fused.

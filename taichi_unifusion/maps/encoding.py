@@ -13,7 +13,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, check_range
+
+MAX_ANCHORS = 1024
+# of the largest eigenvalue of the anchors' kernel matrix: what is smaller is rounding
+LEAST_EIGENVALUE = 1e-13
 
 
 @dataclass(frozen=True)
@@ -30,12 +34,14 @@ class EncoderSettings:
     """Seed of the anchors."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.rank <= self.anchors:
+        check_range("encoder: rank", self.rank, 1, MAX_ANCHORS)
+        check_range("encoder: anchors", self.anchors, 1, MAX_ANCHORS)
+        check_range("encoder: length_scale", self.length_scale, 0.01, 100)
+        check_range("encoder: seed", self.seed, 0, 2**63 - 1)
+        if self.rank > self.anchors:
             raise InputError(
                 f"encoder: rank must lie in 1..anchors, got rank {self.rank} and {self.anchors} anchors"
             )
-        if self.length_scale <= 0:
-            raise InputError(f"encoder: length_scale must be positive, got {self.length_scale}")
 
 
 def matern72(distance: NDArray, length_scale: float) -> NDArray[np.float64]:
@@ -72,9 +78,19 @@ class PositionEncoding:
             values[::-1][: self.settings.rank],
             vectors[:, ::-1][:, : self.settings.rank],
         )
+        if values[-1] < LEAST_EIGENVALUE * values[0]:
+            raise InputError(
+                f"encoder: of {self.settings.anchors} anchors with length_scale "
+                f"{self.settings.length_scale:g}, fewer than {self.settings.rank} eigenpairs are more "
+                "than rounding: use a smaller rank or a smaller length_scale"
+            )
         largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(self.settings.rank)]
         # eigenvectors of the same sign on every machine
         return vectors * np.sign(largest) / np.sqrt(values)
+
+    def check(self) -> None:
+        """Raise InputError where the settings have fewer eigenpairs than the rank asks for."""
+        _ = self.projection
 
     def __call__(self, t: NDArray) -> NDArray[np.float64]:
         """f_posi: (N, 3) encoder coordinates -> (N, l)."""

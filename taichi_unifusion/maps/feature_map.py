@@ -19,25 +19,21 @@ from ..kernels.cells import CELLS
 from ..kernels.patches import Patches
 from ..runtime import DeviceArray
 from ..types import Frame, ImageView, PointCloud
-from .base_map import BaseMap, Integration, check_channels
+from .base_map import BaseMap, Integration
 from .binner import Binner, patches_of
 from .encoder import check_points, to_device, window_masks, workers
 from .encoding import position_encoding
 from .local_lim import Binned
 from .property_map import NEAREST_REACH
-from .settings import FeatureSettings
-from .voxel_grid import MASKS, WEIGHTS, VoxelData, VoxelField, VoxelGrid, latents
+from .settings import MAX_FEATURE_CHANNELS, FeatureSettings, check_channels
+from .voxel_data import VoxelData, feature_fields
+from .voxel_grid import VoxelGrid
 
 GPU_WORKERS = 1024
 NODES = 17  # of the table of position features along an edge of the doubled voxel
 MAX_FEATURE = 1e4  # above it half precision, which ends at 65,504, would lose sums
 TEXTS_AT_ONCE = 64
 CHANNELS_AT_ONCE = 32
-PRECISIONS = {  # name -> types of means and of slopes
-    "int8": (np.dtype(np.float16), np.dtype(np.int8)),
-    "float16": (np.dtype(np.float16), np.dtype(np.float16)),
-    "float32": (np.dtype(np.float32), np.dtype(np.float32)),
-}
 
 
 @dataclass(frozen=True)
@@ -73,10 +69,10 @@ class FeatureMap(BaseMap[FeatureSettings]):
         **overrides: Any,
     ) -> None:
         settings = dataclasses.replace(settings or FeatureSettings(), **overrides)
-        check_channels(f"feature map '{name}'", channels)
+        check_channels(f"feature map '{name}'", channels, MAX_FEATURE_CHANNELS)
         # the first eigenfunction is nearly constant: the mean replaces it, the other rank - 1 stay
         self.rank = settings.encoder.rank - 1
-        super().__init__(name, channels, settings, VoxelGrid(self._fields(channels, settings)))
+        super().__init__(name, channels, settings, VoxelGrid(feature_fields(channels, settings)))
         self.layout = kernels.FeatureLayout(self.rank, settings.precision == "int8")
         self.binner = Binner(self.grid, settings.voxel_size, 0, with_positions=True)
         encoding = position_encoding(settings.encoder)
@@ -84,19 +80,6 @@ class FeatureMap(BaseMap[FeatureSettings]):
         self._table = to_device(encoding.lattice(NODES)[:, 1:])
         self._window = window_masks(settings.margin)
         self._scratch = self._borrow_scratch()
-
-    def _fields(self, channels: int, settings: FeatureSettings) -> list[VoxelField]:
-        """The moments, weights, and rows of features; masks are kept for the form of the files."""
-        mean, slope = PRECISIONS[settings.precision]
-        q = self.rank
-        return [
-            latents(q + q * (q + 1) // 2, 1),
-            WEIGHTS,
-            MASKS,
-            VoxelField("means", mean, (channels,)),
-            VoxelField("slopes", slope, (q * channels,)),
-            VoxelField("scales", np.dtype(np.float32), (q,)),
-        ]
 
     @classmethod
     def _empty(cls, name: str, channels: int, settings: FeatureSettings) -> Self:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import prod
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from ..errors import CapacityError
 from ..kernels.pools import copy_rows, gather_rows
 from ..runtime import DeviceArray
+from .voxel_data import VoxelField
 
 MAX_ELEMENTS = 2**31 - 1  # of an array of Taichi
 _TAICHI = {
@@ -21,20 +21,6 @@ _TAICHI = {
     np.dtype(np.int8): ti.i8,
     np.dtype(np.uint32): ti.u32,
 }
-
-
-@dataclass(frozen=True)
-class VoxelField:
-    """What one pool holds of every voxel; storage, export, files and checks all go by it."""
-
-    name: str  # of the pool, and of the tensor in a map file
-    dtype: np.dtype
-    shape: tuple[int, ...] = ()  # of one voxel
-
-    @property
-    def bytes(self) -> int:
-        """Bytes of one voxel."""
-        return self.dtype.itemsize * prod(self.shape)
 
 
 class Pool:

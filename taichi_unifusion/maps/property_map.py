@@ -14,13 +14,13 @@ from ..errors import InputError
 from ..kernels.patches import Patches, Values
 from ..runtime import DeviceArray
 from ..types import Frame, PointCloud, largest_magnitude
-from .base_map import check_channels
 from .binner import Binner, patches_of
 from .encoder import Encoder
 from .local_lim import LocalLim
 from .regression_map import RegressionMap
-from .settings import PropertySettings
+from .settings import MAX_PROPERTY_CHANNELS, PropertySettings, check_channels
 from .value_scale import by_channel, exponent_of
+from .voxel_data import property_layout
 
 NEAREST_REACH = 2  # voxels
 
@@ -47,8 +47,8 @@ class PropertyMap(RegressionMap[PropertySettings]):
         **overrides: Any,
     ) -> None:
         settings = dataclasses.replace(settings or PropertySettings(), **overrides)
-        check_channels(f"property map '{name}'", channels)
-        super().__init__(name, channels, settings, centered=settings.prior == "mean")
+        check_channels(f"property map '{name}'", channels, MAX_PROPERTY_CHANNELS)
+        super().__init__(name, channels, settings, property_layout(channels, settings))
         self.binner = Binner(self.grid, settings.voxel_size, channels)
 
     @classmethod

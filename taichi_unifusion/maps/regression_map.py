@@ -19,17 +19,15 @@ from .base_map import BaseMap, Integration, S
 from .binner import Binner
 from .encoder import Decoder, Encoder
 from .local_lim import LocalLim
-from .voxel_grid import MASKS, WEIGHTS, VoxelData, VoxelField, VoxelGrid, latents
+from .voxel_data import VoxelData, VoxelField, regression_fields
+from .voxel_grid import VoxelGrid
 
 
 class RegressionGrid(VoxelGrid):
     """The voxels of a regression map, into which local LIMs are fused (Eq. 19)."""
 
     def __init__(self, layout: Layout, noise: float, more: Sequence[VoxelField] = ()) -> None:
-        sums = [VoxelField("sums", np.dtype(np.float32), (layout.sums,))] * layout.information
-        super().__init__(
-            [latents(layout.latent_rows, layout.channels), WEIGHTS, MASKS, *more, *sums]
-        )
+        super().__init__(regression_fields(layout, tuple(more)))
         self.layout, self.noise = layout, noise
 
     def fuse(self, local: LocalLim) -> int:
@@ -102,21 +100,11 @@ class RegressionMap(BaseMap[S]):
         name: str,
         channels: int,
         settings: S,
-        *,
-        centered: bool,
-        derivatives: bool = False,
-        some_normals: bool = False,
+        layout: Layout,
         fields: Sequence[VoxelField] = (),
     ) -> None:
-        self.layout = Layout(
-            settings.encoder.rank,
-            channels,
-            centered,
-            derivatives,
-            some_normals,
-            settings.fusion == "information",
-        )
-        self.grid: RegressionGrid = RegressionGrid(self.layout, settings.noise, fields)
+        self.layout = layout
+        self.grid: RegressionGrid = RegressionGrid(layout, settings.noise, fields)
         super().__init__(name, channels, settings, self.grid)
         self.encoder = Encoder(self.grid.runtime, settings, self.layout)
         self.decoder = Decoder(self.encoder.tables, self.layout, settings.voxel_size)

@@ -7,12 +7,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ..errors import InputError, check_choice
+from ..errors import InputError, check_choice, check_range, shortened
 from .encoding import EncoderSettings
 
 MAX_RESOLUTION = 32  # mesh cells along a voxel's edge
 MAX_WINDOW = 31  # frames that are fused at once: a voxel has a bit for each
+# of a map: kernels unroll over it, and with more would compile for minutes, deaf to Ctrl-C
+MAX_RANK = 64
 MAX_FEATURE_RANK = 20  # of a map of features: its kernels unroll over it
+# of a map of a property: its kernels unroll over them, and compile for half a minute
+MAX_PROPERTY_CHANNELS = 64
+MAX_FEATURE_CHANNELS = 8192
+MAX_NAME = 200  # letters of a map's name
 
 
 @dataclass(frozen=True)
@@ -41,16 +47,12 @@ class MapSettings:
     """The position encoding."""
 
     def __post_init__(self) -> None:
-        if not 1e-4 <= self.voxel_size <= 100:
-            raise InputError(
-                f"voxel_size: must lie between 0.0001 and 100 metres, got {self.voxel_size}"
-            )
-        if not 0 < self.noise < float("inf"):
-            raise InputError(f"noise: must be positive and finite, got {self.noise}")
-        if self.min_points < 1:
-            raise InputError(f"min_points: must be at least 1, got {self.min_points}")
+        check_range("voxel_size", self.voxel_size, 1e-4, 100, "metres")
+        check_range("noise", self.noise, 1e-9, 1e9)
+        check_range("min_points", self.min_points, 1, 1_000_000)
         if self.margin not in (1, 2):
             raise InputError(f"margin: must be 1 or 2 cells, got {self.margin}")
+        check_range("encoder: rank", self.encoder.rank, 1, MAX_RANK)
         check_choice("sampling", self.sampling, ("cells", "points"))
         check_choice("fusion", self.fusion, ("mean", "information"))
 
@@ -85,14 +87,9 @@ class SurfaceSettings(MapSettings):
             raise InputError(
                 f"sample_distance: must lie in (0, 1] voxels, got {self.sample_distance}"
             )
-        if self.support_points < 0:
-            raise InputError(f"support_points: must not be negative, got {self.support_points}")
-        if not 1 <= self.support_closing <= 27:
-            raise InputError(
-                f"support_closing: must lie in 1..27 neighbours, got {self.support_closing}"
-            )
-        if not -127 <= self.min_evidence <= 127:
-            raise InputError(f"min_evidence: must lie in -127..127 frames, got {self.min_evidence}")
+        check_range("support_points", self.support_points, 0, 1_000_000)
+        check_range("support_closing", self.support_closing, 1, 27, "neighbours")
+        check_range("min_evidence", self.min_evidence, -127, 127, "frames")
         check_choice("gpis", self.gpis, ("samples", "derivatives", "both"))
 
 
@@ -165,3 +162,18 @@ class FeatureSettings(MapSettings):
             raise InputError(
                 f"encoder: rank must lie in 2..{MAX_FEATURE_RANK} in a map of features, got {self.encoder.rank}"
             )
+
+
+def check_channels(what: str, channels: int, most: int) -> None:
+    """Raise InputError for a map of no or too many channels; `what` names the map."""
+    if not 1 <= channels <= most:
+        hint = "; vectors of hundreds of numbers go into a FeatureMap" * (most < channels)
+        raise InputError(f"{what}: channels must lie in 1..{most}, got {channels}{hint}")
+
+
+def check_name(what: str, name: object) -> None:
+    """Raise InputError for a map's name that is no text to print; `what` names the map."""
+    if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= MAX_NAME:
+        raise InputError(
+            f"{what}: must be 1 to {MAX_NAME} printable letters, got {shortened(name)}"
+        )

@@ -24,7 +24,7 @@ from .local_lim import LocalLim
 from .meshing import drop_small_parts, extract_mesh
 from .regression_map import RegressionMap
 from .settings import MAX_RESOLUTION, SurfaceSettings
-from .voxel_grid import EVIDENCE, VoxelData
+from .voxel_data import EVIDENCE, VoxelData, surface_layout
 
 
 class SurfaceMap(RegressionMap[SurfaceSettings]):
@@ -43,16 +43,8 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
 
     def __init__(self, settings: SurfaceSettings | None = None, **overrides: Any) -> None:
         settings = dataclasses.replace(settings or SurfaceSettings(), **overrides)
-        derivatives = settings.gpis != "samples"
-        super().__init__(
-            "surface",
-            1,
-            settings,
-            centered=False,
-            derivatives=derivatives,
-            some_normals=settings.gpis == "both",
-            fields=[EVIDENCE] * settings.carve,
-        )
+        layout = surface_layout(settings)
+        super().__init__("surface", 1, settings, layout, [EVIDENCE] * settings.carve)
         beside = settings.sample_distance
         steps = (0.0,) if settings.gpis == "derivatives" else (-beside, 0.0, beside)
         self.steps = np.array(steps, np.float32)  # of samples along a normal [voxels]
@@ -61,7 +53,7 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
             settings.voxel_size,
             self.steps,
             support_points=settings.support_points,
-            with_normals=derivatives,
+            with_normals=layout.derivatives,
         )
 
     @classmethod

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import gc
 import weakref
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,12 +17,12 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..errors import CapacityError, MapCorrupt
+from ..errors import CapacityError
 from ..kernels import index as kernels
-from ..kernels.cells import BLOCK_CELLS
 from ..kernels.pools import gather_rows
 from ..runtime import DeviceArray, grown
-from .pool import Pool, VoxelField
+from .pool import Pool
+from .voxel_data import KEYS, VoxelData, VoxelField
 
 # Bytes of sparse nodes, of one map and of all that the process ever had: Taichi's pool on the CPU
 # fails silently somewhat above 1.6 GB, and gives nothing back.
@@ -38,59 +37,7 @@ BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16
 CUDA_TREE, CUDA_CHUNK, CUDA_RESERVE = 90_000_000, 66_000_000, 330_000_000
 NODES_PER_CHUNK = 16_384
 # room to begin with: what a room needs, so that hardly any video waits, but little memory
-FIRST_CAPACITY, LEAST_CAPACITY, FIRST_BYTES = 131_072, 4096, 16 << 20
-
-KEYS = VoxelField("keys", np.dtype(np.int32), (3,))
-WEIGHTS = VoxelField("weights", np.dtype(np.float32))
-MASKS = VoxelField("masks", np.dtype(np.uint32), (2,))  # support of the voxel's cells
-# frames that saw surface in a cell minus frames that saw through it
-EVIDENCE = VoxelField("evidence", np.dtype(np.int8), (BLOCK_CELLS,))
-
-
-def latents(rows: int, channels: int) -> VoxelField:
-    """The field of latents (r, c): F, and a prior mean."""
-    return VoxelField("latents", np.dtype(np.float32), (rows, channels))
-
-
-@dataclass(frozen=True)
-class VoxelData:
-    """Voxels by value, sorted by index (i, then j, then k): what maps save, load and merge."""
-
-    keys: NDArray[np.int32]  # (N, 3) voxel index
-    fields: Mapping[str, NDArray]  # (N, ...) each, by name
-
-    def __len__(self) -> int:
-        return len(self.keys)
-
-    @property
-    def latents(self) -> NDArray[np.float32]:
-        """(N, r, c)."""
-        return self.fields["latents"]
-
-    @property
-    def weights(self) -> NDArray[np.float32]:
-        """(N,)."""
-        return self.fields["weights"]
-
-    @property
-    def masks(self) -> NDArray[np.uint32]:
-        """(N, 2) support."""
-        return self.fields["masks"]
-
-    @property
-    def evidence(self) -> NDArray[np.int8] | None:
-        """(N, 64) frames for a cell minus frames against it; None where the map counts none."""
-        return self.fields.get("evidence")
-
-    @property
-    def sums(self) -> NDArray[np.float32] | None:
-        """(N, q) of the regression, with `fusion: information`."""
-        return self.fields.get("sums")
-
-    @property
-    def tensors(self) -> dict[str, NDArray]:
-        """Keys and fields, as the arrays of a map file."""
-        return {"keys": self.keys, **self.fields}
+FIRST_CAPACITY, LEAST_CAPACITY, FIRST_BYTES, LEAST_BYTES = 131_072, 4096, 16 << 20, 64 << 20
 
 
 class VoxelGrid:
@@ -104,8 +51,9 @@ class VoxelGrid:
         self.frame = 0
         self.unclosed: Any = None  # `CellArrays` with the keys of the voxels that are touched now
         self.index = self._borrow_tree()
-        room = FIRST_BYTES // max(field.bytes for field in self.fields)
-        capacity = min(max(room, LEAST_CAPACITY), FIRST_CAPACITY)
+        largest = max(field.bytes for field in self.fields)
+        least = min(LEAST_CAPACITY, max(LEAST_BYTES // largest, 1))
+        capacity = min(max(FIRST_BYTES // largest, least), FIRST_CAPACITY)
         self._pools = {field.name: Pool(field, capacity) for field in (KEYS, *self.fields)}
         self._leaves, self._touched = 0, 0
         self._inherited = self.runtime.earlier.get(self.index, 0)
@@ -148,8 +96,9 @@ class VoxelGrid:
             if _too_large(self.runtime):
                 self.runtime.trees -= 1
                 raise CapacityError(
-                    "the index of another map would not fit into the device memory that is kept for "
-                    "indices: delete or save maps, or give uf.init a larger device_memory_gb"
+                    "the index of another map would not fit beside those of the maps of this process: "
+                    "delete or save maps, or go on in a new process; on CUDA also with a larger "
+                    "device_memory_gb for uf.init"
                 )
             tree = _build_tree()
         weakref.finalize(self, free.append, (self.fields, tree))
@@ -298,37 +247,6 @@ class VoxelGrid:
             order = np.argsort(slots, kind="stable").astype(np.int32)
             for field in self.fields:
                 gather_rows(order, data.fields[field.name], self[field.name])
-
-    def check(self, path: object, tensors: Mapping[str, NDArray]) -> VoxelData:
-        """The voxels that a file's tensors hold; raises MapCorrupt where they are not those of such
-        a grid.
-        """
-        n = len(tensors["keys"]) if "keys" in tensors else -1
-        for field in (KEYS, *self.fields):
-            shape, array = (n, *field.shape), tensors.get(field.name)
-            if array is None or array.shape != shape or array.dtype != field.dtype:
-                found = "nothing" if array is None else f"{array.shape} {array.dtype}"
-                raise MapCorrupt(
-                    f"{path}: tensor '{field.name}' should be {shape} {field.dtype}, found "
-                    f"{found}; integrate the frames again"
-                )
-        data = VoxelData(
-            tensors["keys"], {field.name: tensors[field.name] for field in self.fields}
-        )
-        half = kernels.INDEX_HALF
-        if n and not (data.keys.min() >= -half and data.keys.max() < half):
-            raise MapCorrupt(f"{path}: holds voxels out of range; integrate the frames again")
-        for name, values in data.fields.items():
-            if values.dtype.kind == "f" and not np.isfinite(values).all():
-                raise MapCorrupt(
-                    f"{path}: tensor '{name}' holds numbers that are not finite; "
-                    "integrate the frames again"
-                )
-        if not (data.weights > 0).all():
-            raise MapCorrupt(f"{path}: holds voxels of no weight; integrate the frames again")
-        if len(np.unique(data.keys, axis=0)) != n:
-            raise MapCorrupt(f"{path}: holds a voxel twice; integrate the frames again")
-        return data
 
     @property
     def memory_bytes(self) -> int:

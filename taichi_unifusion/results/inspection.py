@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from ..errors import FileError, MapCorrupt, UniFusionError
-from ..files.maps import read_map
+from ..errors import FileError, UniFusionError
 from ..files.mesh_reading import read_any_mesh
+from ..maps.stored import read_stored
 from .lock import who_writes
 from .record import Source, read_record
 from .run_folder import RunFolder
@@ -69,25 +69,19 @@ def inspect(path: Path) -> Inspection:
 
 
 def _describe_map(file: Path) -> list[str]:
-    """A row of MAP_COLUMNS, after the checksums were found right."""
-    tensors, manifest = read_map(file)
-    try:
-        settings, encoder = manifest["settings"], manifest["settings"]["encoder"]
-        kind = f"{manifest['kind']}, {manifest['channels']} channel{'s' if manifest['channels'] > 1 else ''}"
-        return [
-            manifest["name"],
-            kind,
-            f"{len(tensors['keys']):,}",
-            f"{100 * settings['voxel_size']:g} cm",
-            format_bytes(file.stat().st_size),
-            f"Matern-7/2, rank {encoder['rank']} of {encoder['anchors']}, seed {encoder['seed']}",
-            settings["fusion"],
-            str(manifest["format_version"]),
-        ]
-    except (KeyError, TypeError) as error:
-        raise MapCorrupt(
-            f"{file}: its manifest does not describe a map ({error}); write it again"
-        ) from error
+    """A row of MAP_COLUMNS, after everything was checked that loading the map would."""
+    stored, _ = read_stored(file)
+    settings, encoder = stored.settings, stored.settings.encoder
+    return [
+        stored.name,
+        f"{stored.kind}, {stored.channels} channel{'s' if stored.channels > 1 else ''}",
+        f"{stored.voxels:,}",
+        f"{100 * settings.voxel_size:g} cm",
+        format_bytes(file.stat().st_size),
+        f"Matern-7/2, rank {encoder.rank} of {encoder.anchors}, seed {encoder.seed}",
+        settings.fusion,
+        str(stored.version),
+    ]
 
 
 def _describe_writer(folder: RunFolder) -> str | None:

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, UniFusionError
 from ..files.atomic import read_bytes
-from ..files.maps import read_map
 from ..files.mesh_reading import read_any_mesh, read_mesh
 from ..files.ply import color_to_uint8
 from ..files.trajectories import read_trajectory
 from ..geometry.triangles import SurfaceDistance
+from ..maps.stored import read_stored
 from ..rendering.look import Look
 from ..rendering.mesh_checks import check_mesh
 from ..results.outlook import find_mesh_up, read_up
@@ -130,19 +130,18 @@ def _map_layers(mesh: Mesh, folder: RunFolder) -> list[Layer]:
     if file is None:
         return []
     try:
-        tensors, manifest = read_map(file)
-        size = float(manifest["settings"]["voxel_size"])
-        keys, weights = tensors["keys"], tensors["weights"]
-    except (UniFusionError, KeyError, TypeError, ValueError) as error:
+        stored, data = read_stored(file)
+    except UniFusionError as error:
         logger.warning("%s: no weights to show (%s)", file, error)
         return []
-    row = _rows_of(keys, np.floor(mesh.vertices / size).astype(np.int64))
-    weight = _known(weights, row)
+    size, evidence = stored.settings.voxel_size, data.evidence
+    row = _rows_of(data.keys, np.floor(mesh.vertices / size).astype(np.int64))
+    weight = _known(data.weights, row)
     layers = [Layer.of_values("weight", weight, Look("magma", None, "weight of the voxel"))]
-    if "evidence" in tensors:
+    if evidence is not None:
         cells = np.floor(mesh.vertices * (CELLS / size)).astype(np.int64) % CELLS
         cell = (cells[:, 0] * CELLS + cells[:, 1]) * CELLS + cells[:, 2]
-        votes = tensors["evidence"][np.maximum(row, 0), cell].astype(np.float32)
+        votes = evidence[np.maximum(row, 0), cell].astype(np.float32)
         votes[row < 0] = np.nan
         look = Look("diverging", None, "evidence: views that saw it less those that saw through it")
         layers.append(Layer.of_values("evidence", votes, look))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..config import MeshSettings, load_config
 from ..errors import InputError
-from ..files.maps import read_manifest
+from ..maps.stored import read_description
 from ..results.run_folder import RunFolder
 from ..types import Mesh
 from .answers import ShownAnswer, show_answer
@@ -177,7 +177,7 @@ class ResultsSource:
         return {
             name: PropertyMap.load(path)
             for name, path in self._folder.maps.items()
-            if read_manifest(path)["kind"] == PropertyMap.kind
+            if read_description(path).kind == PropertyMap.kind
         }
 
     @cached_property

@@ -16,7 +16,8 @@ from taichi_unifusion.kernels.index import block_of_points, forget_blocks, touch
 from taichi_unifusion.kernels.patches import Patches, Values
 from taichi_unifusion.kernels.regression import find_neighbors
 from taichi_unifusion.maps.binner import FIRST_BLOCKS, Binner, SurfelBinner, patches_of
-from taichi_unifusion.maps.voxel_grid import MASKS, WEIGHTS, VoxelGrid, latents
+from taichi_unifusion.maps.voxel_data import MASKS, WEIGHTS, latents
+from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
 VS = 0.05
 FIXED = 1e-6  # 24 fractional bits, rounded once a run of points, and float32 sums within a run

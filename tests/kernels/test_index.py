@@ -15,8 +15,8 @@ from taichi_unifusion.errors import CapacityError, RuntimeStateError
 from taichi_unifusion.kernels import index as kernels
 from taichi_unifusion.maps import voxel_grid
 from taichi_unifusion.maps.binner import Binner, patches_of
-from taichi_unifusion.maps.pool import VoxelField
-from taichi_unifusion.maps.voxel_grid import EVIDENCE, MASKS, WEIGHTS, VoxelGrid, latents
+from taichi_unifusion.maps.voxel_data import EVIDENCE, MASKS, WEIGHTS, VoxelField, latents
+from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
 VS = 0.05
 

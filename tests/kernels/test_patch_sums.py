@@ -11,7 +11,8 @@ from viewpoints import pose
 
 from taichi_unifusion.kernels import patches as kernels
 from taichi_unifusion.kernels.binning import FIXED
-from taichi_unifusion.maps.voxel_grid import MASKS, WEIGHTS, VoxelGrid
+from taichi_unifusion.maps.voxel_data import MASKS, WEIGHTS
+from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
 FRAME = 5  # of its window
 SUM = 2e-6  # fixed point, rounded once a run, and float32 sums of patches of up to four pixels

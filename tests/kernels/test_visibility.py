@@ -11,7 +11,8 @@ from viewpoints import CAMERA, VS, pose
 from taichi_unifusion import SurfaceMap
 from taichi_unifusion.kernels import visibility as kernels
 from taichi_unifusion.maps.encoding import EncoderSettings
-from taichi_unifusion.maps.voxel_grid import MASKS, WEIGHTS, VoxelGrid
+from taichi_unifusion.maps.voxel_data import MASKS, WEIGHTS
+from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
 ENCODER = EncoderSettings(rank=8, anchors=64)
 FLIPPED = 1e-3  # share of cells in which float32 puts a pixel, or a threshold, on the other side

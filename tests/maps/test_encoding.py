@@ -16,6 +16,7 @@ from taichi_unifusion.maps.encoding import (
     matern72,
     position_encoding,
 )
+from taichi_unifusion.maps.settings import PropertySettings, SurfaceSettings
 
 # what 256 anchors and 20 eigenpairs reach on 2000 random points; other samples differ by 3 %
 KERNEL_ERROR = 0.0058 * 1.03
@@ -235,3 +236,32 @@ def test_between_centers_is_f_posi_of_all_eight_voxels_at_the_same_place():
         wanted = oracle(settings)((u.reshape(-1, 3) - step) / 2)
         np.testing.assert_allclose(between[:, o, :6], wanted, atol=SINGLE)
     assert between.shape == ((SPACES + 1) ** 3, 8, 8) and not between[..., 6:].any()
+
+
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        ({"anchors": 100_000}, "anchors: must lie in 1..1024"),
+        ({"seed": -1}, "seed: must lie in 0"),
+        ({"length_scale": 1e-300}, "length_scale: must lie in 0.01..100"),
+        ({"length_scale": float("nan")}, "length_scale.*got nan"),
+        ({"rank": 20, "anchors": 10}, "rank must lie in 1..anchors"),
+        ({"rank": "8"}, "rank: expected a number"),
+    ],
+)
+def test_c11_settings_out_of_range_are_refused_when_they_are_made(values, word):
+    with pytest.raises(InputError, match=word):
+        EncoderSettings(**values)
+
+
+def test_c11_a_map_of_a_rank_that_compiles_for_minutes_is_refused():
+    for settings in (SurfaceSettings, PropertySettings):
+        with pytest.raises(InputError, match="rank: must lie in 1..64, got 200"):
+            settings(encoder=EncoderSettings(rank=200))
+        assert settings(encoder=EncoderSettings(rank=64)).encoder.rank == 64
+
+
+def test_c11_more_eigenpairs_than_a_wide_kernel_has_are_refused():
+    with pytest.raises(InputError, match="smaller rank or a smaller length_scale"):
+        PositionEncoding(EncoderSettings(rank=64, length_scale=100.0)).check()
+    assert np.isfinite(PositionEncoding(EncoderSettings(rank=64)).projection).all()

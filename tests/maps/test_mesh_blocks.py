@@ -17,7 +17,7 @@ from taichi_unifusion.errors import InputError
 from taichi_unifusion.maps.changes import GROWTH, MeshedSurface, changed_blocks
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.meshing import MESH_BLOCK, mesh_blocks
-from taichi_unifusion.maps.voxel_grid import VoxelData
+from taichi_unifusion.maps.voxel_data import VoxelData
 
 SAME_NORMAL = 1e-6  # whole numbers are summed; what is left is the division
 

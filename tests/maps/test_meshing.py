@@ -15,7 +15,7 @@ from taichi_unifusion.kernels import marching_cubes as kernels
 from taichi_unifusion.maps import SurfaceMap, meshing
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.meshing import drop_small_parts
-from taichi_unifusion.maps.voxel_grid import VoxelData
+from taichi_unifusion.maps.voxel_data import VoxelData
 from taichi_unifusion.types import Mesh
 
 R = 4  # samples a cube edge in these tests

@@ -109,7 +109,7 @@ def test_the_attribute_must_be_there_and_fit(target):
         target.integrate(cloud)
     with pytest.raises(InputError, match="expected 3 channels, the cloud has 2"):
         target.integrate(cloud_of(cloud.points, cloud.normals, rgb=np.zeros((len(cloud), 2))))
-    with pytest.raises(InputError, match="channels must be at least 1"):
+    with pytest.raises(InputError, match="channels must lie in 1..64, got 0"):
         PropertyMap("rgb", 0)
     with pytest.raises(InputError, match="^prior: 'none' is unknown, choose one of mean, zero"):
         PropertyMap("rgb", 3, prior="none")

@@ -312,7 +312,7 @@ def test_text_names_method_options_and_settings_of_the_map():
         ("infrared=linear,low=nan", "low: expected a number, got 'nan'"),
         ("curvature,radius=0.5", "radius: expected a whole number, got '0.5'"),
         ("curvature,radius=0", "radius must lie in 1..50 pixels"),
-        ("saliency,voxel_size=0", "voxel_size: must lie between"),
+        ("saliency,voxel_size=0", "voxel_size: must lie in"),
         ("saliency,prior=none", "prior: 'none' is unknown, choose one of mean, zero"),
         (
             "saliency,name=color",
