@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from tyro.conf import arg
 
 from ..config import Config
@@ -74,6 +75,8 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     from ..results.writer import prepare_results
 
     up = parse_up(options.output.up) if options.output.up else None
+    if up is None and recording.up is not None and not options.poses.tracked:
+        up = Up(np.array(recording.up), "recording")
     folder = prepare_results(options.output.out)
     with lock_folder(folder):
         _say_what_is_replaced(folder, options, encoder is not None)

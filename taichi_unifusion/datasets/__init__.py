@@ -31,21 +31,28 @@ FORMATS = {  # name -> module here, what opens a recording
     "folder": ("folder", "open_folder"),
     "2d3ds": ("stanford", "open_stanford"),
     "scene": ("scene", "open_scene"),
+    "record3d": ("record3d", "open_record3d"),
+    "strayscanner": ("strayscanner", "open_strayscanner"),
+    "polycam": ("polycam", "open_polycam"),
+    "nerfstudio": ("nerfstudio", "open_nerfstudio"),
 }
 
 SENTENCES = {  # what an option of open_dataset means, the same in every format that has it
     "align": "The camera whose pixels the frames have, depth or color; the paper's is color.",
     "camera": "The PinholeCamera of the depth images, instead of the recording's.",
     "classes": "The class of each object by name; others are their own class.",
+    "color_detail": "Pixels for each of the depth image's, across and down: 2 and more suit colour maps below 2 cm.",
     "depth_scale": "Units of the depth images that make a metre.",
     "drop_alpha": "Accept colour images with a fourth channel and ignore it.",
     "frames": "Frames of the loop through the room.",
     "height": "Rows of an image.",
     "max_difference": "How far time stamps of depth, colour and pose may be apart, in seconds.",
+    "min_confidence": "How sure the phone must be of a reading, 0 (not at all) to 2.",
     "noise": "Depth as a Kinect reads it; false: exact depth.",
     "room": "The one room to read, as office_1, instead of the whole area.",
     "seed": "Another number gives other noise.",
     "trajectory": "File of poses to render from: lines 'timestamp tx ty tz qx qy qz qw'.",
+    "weigh_confidence": "Readings of confidence 1 count half as much as those of 2.",
     "width": "Columns of an image.",
 }
 

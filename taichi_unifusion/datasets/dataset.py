@@ -34,6 +34,8 @@ class Dataset(ABC, Sequence[Frame]):
     runs_kernels: bool = False
     # colour is known to fit depth pixel by pixel: it was rendered, or registered by a calibration
     registered: bool = False
+    # the direction against gravity in the world of its poses, where a recording says so
+    up: tuple[float, float, float] | None = None
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -113,7 +115,7 @@ class DatasetView(Dataset):
     def __init__(self, dataset: Dataset, indices: range) -> None:
         self.dataset, self.indices = dataset, indices
         self.name, self.warnings, self.no_poses = dataset.name, dataset.warnings, dataset.no_poses
-        self.registered = dataset.registered
+        self.registered, self.up = dataset.registered, dataset.up
 
     def __len__(self) -> int:
         return len(self.indices)

@@ -1,7 +1,8 @@
 """Registration of two cameras' images: undistort one's images, and resample them as the other
 camera sees them.
 
-Distortion is the rational model of Brown and Conrady as OpenCV has it: k1 k2 p1 p2 k3 k4 k5 k6.
+Distortion is the rational model of Brown and Conrady as OpenCV has it: k1 k2 p1 p2 k3 k4 k5 k6; of a
+fisheye lens k1 k2 k3 k4 of its equidistant model.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ class LensCamera:
     """A pinhole camera with lens distortion."""
 
     pinhole: PinholeCamera
-    distortion: tuple[float, ...]  # k1 k2 p1 p2 k3 k4 k5 k6
+    distortion: tuple[float, ...]  # k1 k2 p1 p2 k3 k4 k5 k6, or k1 k2 k3 k4 of a fisheye
     max_radius: float = MAX_RADIUS
+    fisheye: bool = False
 
     def undistort(self, image: NDArray, target: PinholeCamera) -> NDArray:
         """Colours (H, W, 3) or measurements (H, W) resampled to the pinhole camera `target` with
@@ -73,7 +75,8 @@ def _undistortion(
     """Column and row in the distorted image, both (H, W), of every pixel of `target`; -2 beyond the
     distortion model.
     """
-    map_x, map_y = cv2.initUndistortRectifyMap(
+    start = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+    map_x, map_y = start(
         lens.pinhole.matrix,
         np.array(lens.distortion),
         np.eye(3),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.se3 import FLIP_YZ
 from ..types import Frame
 
 GRID = 48  # points along each image axis
@@ -20,7 +21,6 @@ PLAUSIBLE, CLEARLY_BETTER = 0.5, 0.3
 MIN_POINTS = 100  # seen by both frames; with fewer nothing is concluded
 MIN_MOTION = 0.05, np.radians(3)  # [m], [rad]; with less, all conventions agree
 
-FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 READINGS = {
     "world-to-camera matrices: invert them": np.linalg.inv,
     "OpenGL's axes (y up, z backward): multiply them from the right by diag(1, -1, -1, 1)": lambda T: (

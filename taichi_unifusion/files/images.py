@@ -68,6 +68,14 @@ def read_depth(
     return depth_to_metres(array, str(path), depth_scale, invalid)
 
 
+def read_scaled_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
+    """`read_depth`, where `depth_scale` counts for floats too."""
+    depth = read_depth(path, depth_scale)
+    if path.suffix.lower() == ".npy" and _open_npy(path).dtype.kind == "f":
+        depth /= np.float32(depth_scale)
+    return depth
+
+
 def depth_to_metres(
     raw: NDArray, where: str, depth_scale: float, invalid: Collection[int]
 ) -> NDArray[np.float32]:
@@ -99,6 +107,15 @@ def read_infrared(path: Path) -> NDArray[np.float32]:
     return image.astype(np.float32) * np.float32(257 if image.dtype == np.uint8 else 1)
 
 
+def read_levels(path: Path) -> NDArray[np.uint8]:
+    """The 8-bit picture of one channel at `path`, (H, W), such as of confidence."""
+    image = _decode(_read_bytes(path), str(path))
+    if image.ndim != 2 or image.dtype != np.uint8:
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise FrameError(f"{path}: must be one channel of 8 bits, got {channels} of {image.dtype}")
+    return np.asarray(image, np.uint8)
+
+
 def read_values(path: Path) -> NDArray[np.float32]:
     """The numbers at `path` as (H, W, c) float32: a `.npy` array as it is, a picture of 8 or 16
     bits (RGB) as [0, 1].
@@ -127,6 +144,12 @@ def depth_file_size(path: Path) -> tuple[int, int]:
             raise FrameError(f"{path}: depth must be (H, W), got shape {array.shape}")
         return array.shape[1], array.shape[0]
     header = read_header(_read_bytes(path, HEADER_BYTES), str(path))
+    return header.width, header.height
+
+
+def color_file_size(path: Path) -> tuple[int, int]:
+    """(width, height) of the picture at `path`, from its header."""
+    header = read_header(_read_bytes(path), str(path))
     return header.width, header.height
 
 

@@ -48,6 +48,12 @@ class Pose:
             raise PoseError(f"{self.source}: {self.problem}")
         return check_rigid(self.T_world_camera, self.source)
 
+    def turned(self, T: NDArray[np.float64]) -> Pose:
+        """The pose of a camera whose axes are those of this one times T."""
+        if self.T_world_camera is None:
+            return self
+        return Pose(self.source, self.T_world_camera @ T)
+
     @property
     def usable(self) -> NDArray[np.float64] | None:
         """T_world_camera as a rigid transform, None where it cannot be used."""
@@ -168,7 +174,7 @@ def _parse_pose_rows(
     numbers = np.array(
         [parse_numbers(row[named:], source) for row, source in zip(words, sources, strict=True)]
     )
-    poses = _from_tum(numbers, sources) if named else _from_matrices(numbers, sources)
+    poses = poses_from_quaternions(numbers, sources) if named else _from_matrices(numbers, sources)
     return [PoseRow(pose, name) for pose, name in zip(poses, names, strict=True)]
 
 
@@ -176,8 +182,8 @@ def _expected(columns: Collection[int]) -> str:
     return " or ".join(f"{count} columns ({ROWS[count]})" for count in columns)
 
 
-def _from_tum(numbers: NDArray[np.float64], sources: Sequence[str]) -> list[Pose]:
-    """Poses of rows tx ty tz qx qy qz qw, (N, 7)."""
+def poses_from_quaternions(numbers: NDArray[np.float64], sources: Sequence[str]) -> list[Pose]:
+    """Poses of rows tx ty tz qx qy qz qw, (N, 7), and where each of them stands."""
     lengths = np.linalg.norm(numbers[:, 3:], axis=1)
     usable = np.isfinite(numbers).all(axis=1) & (np.abs(lengths - 1) <= UNIT_TOLERANCE)
     T_world_camera = np.tile(np.eye(4), (len(numbers), 1, 1))

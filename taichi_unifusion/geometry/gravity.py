@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .triangles import areas, sample_patches
 
-How = Literal["given", "floor", "convention", "cameras", "guess"]
+How = Literal["given", "recording", "floor", "convention", "cameras", "guess"]
 
 SAMPLES = 20_000  # points of the surface, evenly over its area
 DIRECTIONS = 600  # normals of samples that are tried as up
@@ -51,6 +51,7 @@ AXES = (
 )  # ups that worlds have, likeliest first
 SAID = {  # how up was found, for people
     "given": "up is as given",
+    "recording": "up is as the recording says",
     "floor": "up is the floor's normal",
     "convention": "up is the axis of the world that all cameras are level to; no floor could be told",
     "cameras": "up is the mean of the cameras' own, a guess: no floor could be told; --up x,y,z gives it",

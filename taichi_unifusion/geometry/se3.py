@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+# camera axes of OpenGL and ARKit (y up, z backward) to ours (y down, z forward), and back
+FLIP_YZ = np.diag([1.0, -1.0, -1.0, 1.0])
 SMALL_ANGLE = 1e-4  # [rad] below it the first terms of a series are exact to float64
 HALF_TURN = 1e-6  # of the sine of the angle: above it the axis is read off R - R^T
 

@@ -12,6 +12,7 @@ from .tables import format_bytes, format_table
 HOW = {  # how up was found
     "floor": "the floor's normal",
     "given": "given",
+    "recording": "as the recording says",
     "convention": "the axis that the cameras are level to",
     "cameras": "a guess, the mean of the cameras' own",
     "guess": "a guess",

@@ -1,0 +1,177 @@
+"""A recording whose depth and colour images show the same view in different sizes, as a phone's do.
+
+Depth keeps its pixels; each takes the mean of the colour pixels that it covers, of which a phone has
+some fifty. Where maps are so fine that more colours show, pixels can be divided: depth is then
+interpolated within surfaces. Every frame may have a camera of its own, for images of the colour's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FrameError, InputError, SizeMismatch
+from ..files.images import SAME_ASPECT, resize_image
+from ..files.trajectories import Pose
+from ..types import Frame, PinholeCamera
+from .dataset import Dataset
+from .depth_registration import LensCamera
+from .plausibility import camera_warnings, pose_warnings
+
+ARKIT_UP = (0.0, 1.0, 0.0)  # its worlds are levelled
+LOW, MIDDLE, HIGH = 0, 1, 2  # how sure a phone is of a reading
+MOST_DETAIL = 8
+BLACK = 4  # of 255; JPEG does not keep black exactly
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What a frame is made from. The functions read files, and raise FrameError."""
+
+    name: str  # for messages
+    lens: Callable[[], LensCamera]  # of an image that shows the view
+    depth: Callable[[], NDArray[np.float32]]  # (h, w) [m], 0 no reading
+    color: Callable[[], NDArray[np.uint8]] | None = None  # (H, W, 3) RGB
+    confidence: Callable[[], NDArray[np.uint8]] | None = None  # LOW, MIDDLE, HIGH
+    pose: Pose | None = None
+    timestamp: float | None = None  # [s]
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """What becomes of readings that the phone is not sure of."""
+
+    least: int = MIDDLE
+    weigh: bool = False  # MIDDLE counts half: every other pixel of it, as on a chessboard
+
+    def __post_init__(self) -> None:
+        if self.least not in (LOW, MIDDLE, HIGH):
+            raise InputError(f"min_confidence: must be 0, 1 or 2, got {self.least}")
+
+    def drop(
+        self, depth: NDArray[np.float32], confidence: NDArray[np.uint8], where: str
+    ) -> NDArray[np.float32]:
+        """The depth image without the readings that are left out."""
+        height, width = depth.shape
+        if confidence.shape != depth.shape:
+            raise SizeMismatch(
+                f"{where}: confidence is {confidence.shape[1]}x{confidence.shape[0]} but depth is {width}x{height}"
+            )
+        kept = confidence >= self.least
+        if self.weigh:
+            white = (np.arange(height)[:, None] + np.arange(width)) % 2 == 0
+            kept &= (confidence >= HIGH) | white
+        return np.where(kept, depth, np.float32(0))
+
+
+class SharedView(Dataset):
+    """Frames of depth and colour images of one view, read when indexed.
+
+    `no_poses` says what is missing where no frame has a pose; black at the border of colour images
+    is no colour where `black_border`; `up` is as `Dataset` has it.
+    """
+
+    registered = True
+
+    def __init__(
+        self,
+        name: str,
+        shots: Sequence[Shot],
+        *,
+        confidence: Confidence | None = None,
+        detail: int = 1,
+        warnings: Iterable[str] = (),
+        no_poses: str = "",
+        black_border: bool = False,
+        up: tuple[float, float, float] | None = None,
+    ) -> None:
+        self.black_border, self.up = black_border, up
+        self.name, self.shots, self.no_poses = name, tuple(shots), no_poses
+        self.confidence, self.detail = confidence or Confidence(), detail
+        if not 1 <= detail <= MOST_DETAIL:
+            raise InputError(f"color_detail: must be from 1 to {MOST_DETAIL}, got {detail}")
+        self.pose_warnings = (
+            (f"{no_poses}, so the frames have no poses",)
+            if no_poses
+            else tuple(pose_warnings([shot.pose for shot in shots if shot.pose is not None]))
+        )
+        self.warnings = (*warnings, *_lens_warnings(self.shots), *self.pose_warnings)
+
+    def __len__(self) -> int:
+        return len(self.shots)
+
+    def without_poses(self) -> SharedView:
+        """The same frames, their poses left out; so are the warnings about those."""
+        bare = copy(self)
+        bare.shots = tuple(replace(shot, pose=None) for shot in self.shots)
+        bare.warnings = tuple(each for each in self.warnings if each not in self.pose_warnings)
+        return bare
+
+    def pose_at(self, index: int) -> tuple[float | None, NDArray[np.float64] | None]:
+        shot = self.shots[index]
+        return shot.timestamp, shot.pose.usable if shot.pose else None
+
+    def load(self, index: int) -> Frame:
+        """Read frame `index`; FrameError (PoseError, SizeMismatch) names what is wrong."""
+        shot = self.shots[index]
+        T_world_camera = shot.pose.checked() if shot.pose else None
+        lens, depth = shot.lens(), shot.depth()
+        if shot.confidence is not None:
+            depth = self.confidence.drop(depth, shot.confidence(), shot.name)
+        height, width = depth.shape
+        own = resized_lens(lens, width, height, f"{shot.name}: depth")
+        camera = own.pinhole.resized(self.detail * width, self.detail * height)
+        if any(lens.distortion) or self.detail > 1:
+            depth = own.undistort_depth(depth, camera)
+        color = None if shot.color is None else _color(shot, lens, camera)
+        frame = Frame(depth, camera, color, T_world_camera, index, shot.timestamp, shot.name)
+        border = _black_border(color) if self.black_border and color is not None else None
+        if color is None or border is None or not border.any():
+            return frame
+        known = color.astype(np.float32) / np.float32(255)
+        known[border] = np.nan
+        return frame.with_image("color", known)
+
+
+def resized_lens(lens: LensCamera, width: int, height: int, what: str) -> LensCamera:
+    """The lens for an image of that size of the same view; SizeMismatch for another shape."""
+    own = lens.pinhole
+    if abs(width * own.height / (height * own.width) - 1) > SAME_ASPECT:
+        turned = abs(width * own.width / (height * own.height) - 1) <= SAME_ASPECT
+        raise SizeMismatch(
+            f"{what} is {width}x{height} but its camera is for {own.width}x{own.height} images, "
+            + ("which are turned by a quarter" if turned else "another shape")
+        )
+    return replace(lens, pinhole=own.resized(width, height))
+
+
+def _color(shot: Shot, lens: LensCamera, camera: PinholeCamera) -> NDArray[np.uint8]:
+    """The colour (h, w, 3) of a depth image's pixels: means of those they cover."""
+    assert shot.color is not None
+    color = shot.color()
+    height, width = color.shape[:2]
+    own = resized_lens(lens, width, height, f"{shot.name}: colour")
+    if any(lens.distortion):
+        color = own.undistort(color, own.pinhole)
+    return resize_image(color, *camera.size, f"{shot.name}: colour")
+
+
+def _black_border(color: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """The pixels (h, w) that are black and hang together with the image's border."""
+    black = (color.max(axis=2) <= BLACK).astype(np.uint8)
+    _, labels = cv2.connectedComponents(black, connectivity=4)
+    at_border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    return np.isin(labels, at_border[at_border > 0])
+
+
+def _lens_warnings(shots: Sequence[Shot]) -> list[str]:
+    """What is odd about the first frame's camera."""
+    try:
+        return camera_warnings(shots[0].lens().pinhole) if shots else []
+    except FrameError:
+        return []
