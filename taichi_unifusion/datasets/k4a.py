@@ -32,17 +32,14 @@ from ..files.k4a_container import (
     read_contents,
     read_images,
 )
-from ..files.trajectories import Pose, read_stamped_poses
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..types import Frame, PinholeCamera
 from .dataset import Dataset
-from .depth_registration import LensCamera, color_for_depth, splat_depth
 from .k4a_calibration import read_calibration
-from .plausibility import pose_warnings
+from .sensor_rig import SensorRig, poses_beside
 
 DEPTH_SCALE = 1000.0
 MAX_DIFFERENCE = 0.02  # [s] between a pose and a depth image
-FINER = 1.5  # readings a pixel of the colour camera that keep depth free of holes there
 
 
 def open_k4a(
@@ -99,31 +96,17 @@ class K4aFile(Dataset):
             raise DatasetError(
                 f"{path}: align 'color' needs a colour track, and this recording has none"
             )
+        known = self.calibration
+        self.rig = SensorRig(known.depth, known.color, known.T_color_depth, align)
+        if known.color is None and COLOR in contents.sizes:
+            raise DatasetError(f"{path}: {CALIBRATION} knows no colour camera")
         times = self.unit * np.array([capture.depth for capture in self.captures])
-        self.poses = _read_poses(path.with_suffix(".txt"), times, max_difference)
-        self.warnings = tuple(
-            pose_warnings(
-                [pose for pose in self.poses if pose.T_world_camera is not None or pose.problem]
-            )
-        )
-        if any(pose.T_world_camera is None and not pose.problem for pose in self.poses):
-            self.warnings = (
-                f"there is no {path.with_suffix('.txt').name} with poses beside {path.name}: the first frame's "
-                "camera is the world, and the other frames have no pose",
-            )
+        self.poses, self.warnings = poses_beside(path, times, max_difference)
 
     @property
     def camera(self) -> PinholeCamera:
         """The pinhole camera of the frames."""
-        lens = self._color_lens() if self.align == "color" else self.calibration.depth
-        return lens.pinhole
-
-    def _color_lens(self) -> LensCamera:
-        """The colour camera; a recording that shows colour, or is aligned to it, has one."""
-        lens = self.calibration.color
-        if lens is None:
-            raise DatasetError(f"{self.path}: {CALIBRATION} knows no colour camera")
-        return lens
+        return self.rig.camera
 
     def __len__(self) -> int:
         return len(self.captures)
@@ -138,47 +121,12 @@ class K4aFile(Dataset):
         images = read_images(self.path, capture.stamps, where)
         raw = images[DEPTH]
         depth = depth_to_metres(raw, f"{where} depth", self.depth_scale, ())
-        infrared = (
-            images[INFRARED].astype(np.float32)
-            if INFRARED in images
-            else np.zeros(raw.shape, np.float32)
-        )
-        register = self._to_color if self.align == "color" else self._to_depth
-        depth, color, infrared = register(depth, images.get(COLOR), infrared)
+        infrared = images[INFRARED].astype(np.float32) if INFRARED in images else None
+        depth, color, infrared = self.rig.register(depth, images.get(COLOR), infrared)
         frame = Frame(
             depth, self.camera, color, T_world_camera, index, capture.depth * self.unit, where
         )
-        return frame.with_image("infrared", infrared) if INFRARED in images else frame
-
-    def _to_depth(
-        self, depth: NDArray, color: NDArray | None, infrared: NDArray
-    ) -> tuple[NDArray, NDArray | None, NDArray]:
-        cameras, camera = self.calibration, self.camera
-        depth = cameras.depth.undistort_depth(depth, camera)
-        infrared = cameras.depth.undistort(infrared, camera)
-        if color is not None:
-            color, seen = color_for_depth(
-                color, self._color_lens(), depth, camera, cameras.T_color_depth
-            )
-            depth[~seen] = 0
-        return depth, color, infrared
-
-    def _to_color(
-        self, depth: NDArray, color: NDArray | None, infrared: NDArray
-    ) -> tuple[NDArray, NDArray | None, NDArray]:
-        cameras, lens, camera = self.calibration, self._color_lens(), self.camera
-        own = cameras.depth.pinhole
-        factor = int(np.ceil(FINER * max(camera.fx / own.fx, camera.fy / own.fy)))
-        finer = own.resized(own.width * factor, own.height * factor)
-        depth, infrared = splat_depth(
-            cameras.depth.undistort_depth(depth, finer),
-            cameras.depth.undistort(infrared, finer),
-            finer,
-            camera,
-            cameras.T_color_depth,
-        )
-        depth[~lens.sees(camera)] = 0
-        return depth, None if color is None else lens.undistort(color, camera), infrared
+        return frame if infrared is None else frame.with_image("infrared", infrared)
 
 
 def _captures(stamps: dict[str, NDArray[np.int64]]) -> list[Capture]:
@@ -202,23 +150,4 @@ def _captures(stamps: dict[str, NDArray[np.int64]]) -> list[Capture]:
     return [
         Capture(int(at), color, infrared)
         for at, color, infrared in zip(depth, found[COLOR], found[INFRARED], strict=True)
-    ]
-
-
-def _read_poses(file: Path, times: NDArray[np.float64], max_difference: float) -> list[Pose]:
-    """The pose of every frame, by its time [s]; without a file the first frame is the origin and
-    nothing is known of others.
-    """
-    if not file.exists():
-        return [Pose("first frame", np.eye(4)), *(Pose(f"no {file.name}") for _ in times[1:])]
-    rows = sorted(read_stamped_poses(file), key=lambda row: row.timestamp)
-    stamps, nothing = (
-        np.array([row.timestamp for row in rows]),
-        f"no pose within {max_difference} s of the frame",
-    )
-    return [
-        rows[i].pose
-        if abs(stamps[i] - time) <= max_difference
-        else Pose(str(file), problem=nothing)
-        for i, time in zip(nearest(stamps, times), times, strict=True)
     ]
