@@ -35,10 +35,16 @@ FORMATS = {  # name -> module here, what opens a recording
     "strayscanner": ("strayscanner", "open_strayscanner"),
     "polycam": ("polycam", "open_polycam"),
     "nerfstudio": ("nerfstudio", "open_nerfstudio"),
+    "rosbag": ("rosbag", "open_rosbag"),
 }
 
 SENTENCES = {  # what an option of open_dataset means, the same in every format that has it
     "align": "The camera whose pixels the frames have, depth or color; the paper's is color.",
+    "camera_topic": "Topic of the depth camera's CameraInfo, instead of the one beside the images.",
+    "color_topic": "Topic of the colour images, or none; needed where several could be meant.",
+    "depth_topic": "Topic of the depth images; needed where several could be meant.",
+    "pose_topic": "Topic of the camera's poses, or tf for transforms.",
+    "world_frame": "Frame of the transforms that is the world, as odom; the root of their tree is.",
     "camera": "The PinholeCamera of the depth images, instead of the recording's.",
     "classes": "The class of each object by name; others are their own class.",
     "color_detail": "Pixels for each of the depth image's, across and down: 2 and more suit colour maps below 2 cm.",

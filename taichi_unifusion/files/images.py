@@ -33,7 +33,7 @@ def read_color(path: Path, *, drop_alpha: bool = False) -> NDArray[np.uint8]:
 
 def decode_color(data: bytes, where: str, *, drop_alpha: bool = False) -> NDArray[np.uint8]:
     """The bytes of a PNG or JPEG file as (H, W, 3) RGB; `where` names them in messages."""
-    image = _decode(data, where)
+    image = decode_image(data, where)
     if image.dtype != np.uint8:
         raise FrameError(
             f"{where}: colour must be 8 bits a channel, got {image.dtype}; is this a depth image?"
@@ -59,7 +59,7 @@ def read_depth(
     """
     if path.suffix.lower() != ".npy":
         return depth_to_metres(
-            _decode(_read_bytes(path), str(path)), str(path), depth_scale, invalid
+            decode_image(_read_bytes(path), str(path)), str(path), depth_scale, invalid
         )
     array = np.array(_open_npy(path))
     if array.ndim == 2 and np.issubdtype(array.dtype, np.floating):
@@ -96,7 +96,7 @@ def depth_to_metres(
 
 def read_infrared(path: Path) -> NDArray[np.float32]:
     """The infrared image at `path`, one channel of 8 or 16 bits, as (H, W) float32 of 0..65535."""
-    image = _decode(_read_bytes(path), str(path))
+    image = decode_image(_read_bytes(path), str(path))
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise FrameError(
@@ -127,7 +127,7 @@ def read_values(path: Path) -> NDArray[np.float32]:
                 f"{path}: must hold (H, W) or (H, W, c) numbers, got {array.shape} {array.dtype}"
             )
         return np.ascontiguousarray(array.reshape(*array.shape[:2], -1), np.float32)
-    image = _decode(_read_bytes(path), str(path))
+    image = decode_image(_read_bytes(path), str(path))
     if image.dtype not in (np.uint8, np.uint16):
         raise FrameError(f"{path}: a picture must have 8 or 16 bits a channel, got {image.dtype}")
     image = image.reshape(*image.shape[:2], -1)
@@ -212,7 +212,8 @@ def _read_bytes(path: Path, count: int = -1) -> bytes:
         ) from error
 
 
-def _decode(data: bytes, where: str) -> NDArray:
+def decode_image(data: bytes, where: str) -> NDArray:
+    """The bytes of a PNG, JPEG or PGM file as OpenCV decodes them, unchanged; FrameError otherwise."""
     header = read_header(data, where)
     check_whole(data, header, where)
     try:
