@@ -34,6 +34,7 @@ IMPORT_NAMES = {
     "yaml": "pyyaml",
     "fast_simplification": "fast-simplification",
     "pxr": "usd-core",
+    "backports": "backports-zstd",
 }
 
 

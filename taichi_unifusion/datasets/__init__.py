@@ -35,6 +35,8 @@ FORMATS = {  # name -> module here, what opens a recording
     "strayscanner": ("strayscanner", "open_strayscanner"),
     "polycam": ("polycam", "open_polycam"),
     "nerfstudio": ("nerfstudio", "open_nerfstudio"),
+    "open3d": ("open3d_system", "open_open3d"),
+    "realsense": ("realsense", "open_realsense"),
     "rosbag": ("rosbag", "open_rosbag"),
 }
 
@@ -59,6 +61,7 @@ SENTENCES = {  # what an option of open_dataset means, the same in every format 
     "seed": "Another number gives other noise.",
     "trajectory": "File of poses to render from: lines 'timestamp tx ty tz qx qy qz qw'.",
     "weigh_confidence": "Readings of confidence 1 count half as much as those of 2.",
+    "trajectory": "File of poses: those to render from, or those of the frames where several files hold some.",
     "width": "Columns of an image.",
 }
 

@@ -247,14 +247,11 @@ def _decompressor(kind: str) -> Callable[[bytes, int], bytes]:
 
 
 def zstd():
-    """The module of Zstandard: Python's own, or the one that comes with rosbags."""
+    """The module of Zstandard that comes with rosbags."""
     try:
         from backports import zstd as module
     except ImportError:
-        try:
-            from compression import zstd as module  # type: ignore[import-not-found,no-redef]
-        except ImportError:
-            raise missing_rosbags() from None
+        raise missing_rosbags() from None
     return module
 
 
