@@ -35,6 +35,8 @@ IMPORT_NAMES = {
     "fast_simplification": "fast-simplification",
     "pxr": "usd-core",
     "backports": "backports-zstd",
+    "OpenEXR": "openexr",
+    "liblzfse": "pyliblzfse",
 }
 
 

@@ -42,27 +42,26 @@ FORMATS = {  # name -> module here, what opens a recording
 
 SENTENCES = {  # what an option of open_dataset means, the same in every format that has it
     "align": "The camera whose pixels the frames have, depth or color; the paper's is color.",
-    "camera_topic": "Topic of the depth camera's CameraInfo, instead of the one beside the images.",
-    "color_topic": "Topic of the colour images, or none; needed where several could be meant.",
-    "depth_topic": "Topic of the depth images; needed where several could be meant.",
-    "pose_topic": "Topic of the camera's poses, or tf for transforms.",
-    "world_frame": "Frame of the transforms that is the world, as odom; the root of their tree is.",
     "camera": "The PinholeCamera of the depth images, instead of the recording's.",
+    "camera_topic": "Topic of the depth camera's CameraInfo, instead of the one beside the images.",
     "classes": "The class of each object by name; others are their own class.",
     "color_detail": "Pixels for each of the depth image's, across and down: 2 and more suit colour maps below 2 cm.",
+    "color_topic": "Topic of the colour images, or none; needed where several could be meant.",
     "depth_scale": "Units of the depth images that make a metre.",
+    "depth_topic": "Topic of the depth images; needed where several could be meant.",
     "drop_alpha": "Accept colour images with a fourth channel and ignore it.",
     "frames": "Frames of the loop through the room.",
     "height": "Rows of an image.",
     "max_difference": "How far time stamps of depth, colour and pose may be apart, in seconds.",
     "min_confidence": "How sure the phone must be of a reading, 0 (not at all) to 2.",
     "noise": "Depth as a Kinect reads it; false: exact depth.",
+    "pose_topic": "Topic of the camera's poses, or tf for transforms.",
     "room": "The one room to read, as office_1, instead of the whole area.",
     "seed": "Another number gives other noise.",
-    "trajectory": "File of poses to render from: lines 'timestamp tx ty tz qx qy qz qw'.",
-    "weigh_confidence": "Readings of confidence 1 count half as much as those of 2.",
     "trajectory": "File of poses: those to render from, or those of the frames where several files hold some.",
+    "weigh_confidence": "Readings of confidence 1 count half as much as those of 2.",
     "width": "Columns of an image.",
+    "world_frame": "Frame of the transforms that is the world, as odom; the root of their tree is.",
 }
 
 __all__ = [

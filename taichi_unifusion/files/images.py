@@ -109,7 +109,7 @@ def read_infrared(path: Path) -> NDArray[np.float32]:
 
 def read_levels(path: Path) -> NDArray[np.uint8]:
     """The 8-bit picture of one channel at `path`, (H, W), such as of confidence."""
-    image = _decode(_read_bytes(path), str(path))
+    image = decode_image(_read_bytes(path), str(path))
     if image.ndim != 2 or image.dtype != np.uint8:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise FrameError(f"{path}: must be one channel of 8 bits, got {channels} of {image.dtype}")
