@@ -57,7 +57,7 @@ def measure(
     reconstruction: Reconstruction, scene: Scene
 ) -> tuple[dict[str, float | None], tuple[FrameScore, ...]]:
     """All numbers of one row of the table, and the scores of the held-out frames."""
-    near, far = DEPTH_RANGE
+    near, far = scene.nearest, DEPTH_RANGE[1]
     numbers = {
         "map_mb": reconstruction.surface_mb + reconstruction.color_mb,
         "surface_mb": reconstruction.surface_mb,
@@ -149,7 +149,7 @@ def run(options: argparse.Namespace) -> dict[str, dict[str, dict]]:
         )
         rows, pictures = results.setdefault(scene_name, {}), {}
         for name in options.methods:
-            reconstruction = method(name)(scene.frames)
+            reconstruction = method(name)(scene.frames, scene.nearest)
             label = Path(name).stem if name not in METHODS else name
             numbers, scores = measure(reconstruction, scene)
             rows[label] = {"numbers": numbers, "settings": reconstruction.settings}

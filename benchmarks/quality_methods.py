@@ -63,9 +63,9 @@ class Stopwatch:
         return tuple(float(x) for x in np.median(self.laps[2:] or self.laps, axis=0))
 
 
-def ours(config: Config, frames: Sequence[Frame]) -> Reconstruction:
-    """The pipeline under a configuration."""
-    near, far = DEPTH_RANGE
+def ours(config: Config, frames: Sequence[Frame], near: float = DEPTH_RANGE[0]) -> Reconstruction:
+    """The pipeline under a configuration, on readings from `near` [m]."""
+    far = DEPTH_RANGE[1]
     config = replace(config, preprocess=replace(config.preprocess, depth_min=near, depth_max=far))
     pipeline, watch = Pipeline(config), Stopwatch([])
     for frame in frames:
@@ -93,11 +93,13 @@ def ours(config: Config, frames: Sequence[Frame]) -> Reconstruction:
 
 def tsdf(
     frames: Sequence[Frame],
+    near: float = DEPTH_RANGE[0],
+    *,
     voxel_size: float,
     truncation: float = TRUNCATION,
     min_weight: float = MIN_WEIGHT,
 ) -> Reconstruction:
-    """Open3D's VoxelBlockGrid on the raw depth, float32."""
+    """Open3D's VoxelBlockGrid on the raw depth from `near` [m], float32."""
     try:
         import open3d as o3d
         from open3d.core import Device, Tensor, float32
@@ -113,7 +115,7 @@ def tsdf(
     K, watch = Tensor(matrix), Stopwatch([])
     for frame in frames:
         depth = o3d.t.geometry.Image(
-            Tensor(np.where(frame.depth < DEPTH_RANGE[0], 0, frame.depth).astype(np.float32))
+            Tensor(np.where(frame.depth < near, 0, frame.depth).astype(np.float32))
         )
         color = o3d.t.geometry.Image(Tensor(frame.color.astype(np.float32) / 255))
         T_camera_world = Tensor(np.linalg.inv(frame.T_world_camera))
@@ -150,15 +152,19 @@ def tsdf(
     )
 
 
+# frames and their nearest reading [m] -> a reconstruction
+Method = Callable[[Sequence[Frame], float], Reconstruction]
+
+
 def _finer() -> Config:
     config = Config()
     return replace(config, surface=replace(config.surface, voxel_size=0.04))
 
 
-METHODS: dict[str, Callable[[Sequence[Frame]], Reconstruction]] = {
-    "ours": lambda frames: ours(Config(), frames),
-    "ours-4cm": lambda frames: ours(_finer(), frames),
-    "paper": lambda frames: ours(load_config(PAPER), frames),
+METHODS: dict[str, Method] = {
+    "ours": partial(ours, Config()),
+    "ours-4cm": partial(ours, _finer()),
+    "paper": partial(ours, load_config(PAPER)),
     "tsdf-1cm": partial(tsdf, voxel_size=0.01),
     "tsdf-2cm": partial(tsdf, voxel_size=0.02),
     "tsdf-0.5cm": partial(tsdf, voxel_size=0.005),
@@ -166,7 +172,7 @@ METHODS: dict[str, Callable[[Sequence[Frame]], Reconstruction]] = {
 }
 
 
-def method(name: str) -> Callable[[Sequence[Frame]], Reconstruction]:
+def method(name: str) -> Method:
     """A method of METHODS, ours under the YAML file of that name, or a TSDF such as tsdf-1cm-t8-w3:
     truncation, weight.
     """

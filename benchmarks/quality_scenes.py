@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from house import load_house
+from tabletop import Tabletop
 
 from taichi_unifusion.datasets import Dataset, open_dataset
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
@@ -29,6 +30,7 @@ class Scene:
     frames: Sequence[Frame]
     held_out: Sequence[Frame]
     ground_truth: Mesh | None
+    nearest: float = DEPTH_RANGE[0]  # [m] of the readings that are fused, and compared with
 
     @property
     def T_world_camera(self) -> np.ndarray:
@@ -59,6 +61,19 @@ def synthetic(data: Path, frames: int | None) -> Scene:
         [noisy[i] for i in fused],
         [exact[i] for i in between],
         noisy.ground_truth_mesh(),
+    )
+
+
+def tabletop(data: Path, frames: int | None) -> Scene:
+    """Small things on a table, from 40 cm: one loop, as in the synthetic room."""
+    fused, between = split(2 * (frames or 40), 2)
+    noisy, exact = (Tabletop(frames=2 * (frames or 40), noise=noise) for noise in (True, False))
+    return Scene(
+        "tabletop",
+        [noisy[i] for i in fused],
+        [exact[i] for i in between],
+        noisy.ground_truth_mesh(),
+        nearest=0.15,
     )
 
 
@@ -97,6 +112,7 @@ def _of_recording(
 # name -> what makes it of the data folder and a number of frames
 SCENES: dict[str, Callable[[Path, int | None], Scene]] = {
     "synthetic": synthetic,
+    "tabletop": tabletop,
     "kitchen": kitchen,
     "kitchen-tracked": partial(kitchen, tracked=True),
     "house-living": partial(house, "living"),

@@ -7,24 +7,30 @@ that it used.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 import yaml
 
-from .errors import ConfigError, InputError, convert, did_you_mean, shortened
+from .errors import ConfigError, InputError, check_choice, convert, did_you_mean, shortened
 from .files.strict_yaml import read_yaml
+from .maps.detail import ROOM, Detail, choose_voxel_size, sight_of
 from .maps.settings import (
     MAX_RESOLUTION,
     MAX_WINDOW,
     FeatureSettings,
+    MapSettings,
     PropertySettings,
     SurfaceSettings,
+    check_voxel_size,
 )
 from .preprocessing import PreprocessSettings
 from .tracking.base import TrackingSettings
+from .types import Frame
+
+S = TypeVar("S", bound=MapSettings)
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,14 @@ class MeshSettings:
 class Config:
     """Every setting of a reconstruction."""
 
+    detail: Detail = "auto"
+    """Which voxel sizes. auto: those that fit what the first frames see, 5 cm in a room and less
+    where all is near; fine, coarse: half and twice that.
+    """
+    voxel_size: float = 0.0
+    """Voxel edge of the surface in metres, with half of it for colour, and other properties in
+    proportion; 0: as `detail` says. The sizes of single maps count more.
+    """
     device: Literal["auto", "cuda", "cpu"] = "auto"
     """Where to compute; auto: on a CUDA GPU if there is one, else on the CPU."""
     threads: int = 0
@@ -72,18 +86,48 @@ class Config:
     """What else to map, as NAME[=METHOD[:FILE]][,option=value...], for example saliency or
     style=sketch.
     """
-    property_map: PropertySettings = field(default_factory=lambda: PropertySettings(voxel_size=0.1))
+    property_map: PropertySettings = field(default_factory=PropertySettings)
     """The maps of these; a property may say otherwise, as in saliency,voxel_size=0.05."""
     feature_map: FeatureSettings = field(default_factory=FeatureSettings)
     """The map of image-text features."""
     mesh: MeshSettings = field(default_factory=MeshSettings)
     """The mesh."""
 
+    @property
+    def scale(self) -> float:
+        """How large voxels are beside those of a room; 0 where nothing has settled it yet."""
+        return self.voxel_size / ROOM
+
+    def settled(self, frames: Iterable[Frame]) -> Config:
+        """The same with the voxel sizes of surface, colour and features that fit these frames, as
+        `detail` says; what is given already stays. No frame, or none with a reading, is a room.
+        """
+        near, far = self.preprocess.depth_min, self.preprocess.depth_max
+        size = self.voxel_size or choose_voxel_size(sight_of(frames, near, far), self.detail)
+        scale = size / ROOM
+        return replace(
+            self,
+            voxel_size=size,
+            surface=_sized(self.surface, scale),
+            color=_sized(self.color, scale),
+            feature_map=_sized(self.feature_map, scale),
+        )
+
     def __post_init__(self) -> None:
+        check_choice("detail", self.detail, get_args(Detail))
+        check_voxel_size(self.voxel_size)
         if self.threads < 0:
             raise InputError(f"threads: must not be negative, got {self.threads}")
         if not 1 <= self.window <= MAX_WINDOW:
             raise InputError(f"window: must lie in 1..{MAX_WINDOW} frames, got {self.window}")
+
+
+def _sized(settings: S, scale: float) -> S:
+    """The settings of a map with the voxel size that is usual for it times `scale`, if they have
+    none.
+    """
+    size = float(f"{scale * settings.usual_voxel_size:.6g}")
+    return settings if settings.voxel_size else replace(settings, voxel_size=size)
 
 
 def load_config(path: str | Path, base: Config | None = None) -> Config:

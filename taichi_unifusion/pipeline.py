@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,10 @@ from .errors import FrameError, InputError, as_known
 from .kernels.patches import Patches
 from .language.source import FeatureSource
 from .maps import BaseMap, FeatureMap, Integration, PropertyMap, SurfaceMap
+from .maps.detail import Sight, sight_of
 from .maps.kept_window import KeptWindow
 from .maps.property_group import group_maps
+from .maps.settings import PropertySettings
 from .maps.window import WindowFusion
 from .networks.encoders import ImageEncoder
 from .preprocessing import PreprocessSettings, find_patches, invert_depth, preprocess
@@ -32,6 +34,8 @@ from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, SkippedFrame, 
 from .types import Frame, Mesh, PinholeCamera
 
 logger = logging.getLogger(__name__)
+
+SETTLE_FRAMES, SETTLE_STEP = 5, 5  # of a sequence, that voxel sizes are chosen by
 
 
 class Source(Protocol):
@@ -43,6 +47,14 @@ class Source(Protocol):
     def add_to(self, frame: Frame) -> Frame: ...
 
     def make_map(self, frame: Frame) -> BaseMap: ...
+
+
+class PropertySource(Source, Protocol):
+    """A source whose map is made before the first frame."""
+
+    def with_settings(self, settings: PropertySettings, scale: float) -> PropertySource: ...
+
+    def make_map(self, frame: Frame | None = None) -> BaseMap: ...
 
 
 # is told of a frame that was fused, what that did, and the pipeline
@@ -73,20 +85,64 @@ class Pipeline:
         self.config = config = config or Config()
         self.synchronize = synchronize
         made = [make_property(text, config.property_map) for text in config.properties]
-        made = [source.with_settings(config.property_map) for source in (*made, *properties)]
         features = [FeatureSource(encoder, config.feature_map)] if encoder is not None else []
-        self.sources: dict[str, Source] = _by_name((*made, *features))
+        self.sources = _by_name((*made, *properties, *features))
         runtime.init(config.device, threads=config.threads or None)
-        self.surface = SurfaceMap(config.surface)
-        color = PropertyMap("color", 3, config.color)
-        self.maps: dict[str, BaseMap] = {each.name: each for each in (self.surface, color)}
-        for source in made:  # maps of features wait for the first features
-            self.maps[source.name] = source.make_map()
-        self.groups = group_maps(self.maps.values())
         self.fusion = WindowFusion(config.window, keep)
-        finest = min(each.voxel_size for each in self.maps.values())
+        self._maps: dict[str, BaseMap] = {}
+        given = config.surface.voxel_size and config.color.voxel_size and not self.sources
+        if config.voxel_size or given:  # nothing is left to choose
+            self._make_maps(config.settled(()))
+
+    def settle(self, frames: Iterable[Frame]) -> bool:
+        """Choose the voxel sizes that fit these frames, as `Config.detail` says, and make the maps;
+        whether they are there. They are not where no frame has a reading in range.
+
+        `run` and `step` do so with their first frames.
+        """
+        if not self._maps:
+            settings, frames = self.config.preprocess, tuple(frames)
+            sight = sight_of(frames, settings.depth_min, settings.depth_max)
+            if sight is None:
+                return False
+            self._make_maps(self.config.settled(frames))
+            logger.info("%s", _sizes_sentence(self.config, sight))
+        return True
+
+    def _make_maps(self, config: Config) -> None:
+        """Empty maps at the sizes of a settled configuration; those of features wait for the first
+        features.
+        """
+        self.config = config
+        maps: list[BaseMap] = [SurfaceMap(config.surface), PropertyMap("color", 3, config.color)]
+        for name, source in self.sources.items():
+            if isinstance(source, FeatureSource):
+                self.sources[name] = replace(source, settings=config.feature_map)
+            else:
+                sized = cast(PropertySource, source).with_settings(
+                    config.property_map, config.scale
+                )
+                self.sources[name] = sized
+                maps.append(sized.make_map())
+        self._maps = {each.name: each for each in maps}
+        self.groups = group_maps(maps)
+        finest = min(each.voxel_size for each in maps)
         patch_size = min(config.preprocess.patch_size, finest / 2)
         self._preprocess = replace(config.preprocess, patch_size=patch_size)
+
+    @property
+    def maps(self) -> dict[str, BaseMap]:
+        """All maps by name; whoever asks before the first frame gets those of a room."""
+        if not self._maps:
+            self._make_maps(self.config.settled(()))
+        return self._maps
+
+    @property
+    def surface(self) -> SurfaceMap:
+        """The map of the surface; see `maps`."""
+        surface = self.maps["surface"]
+        assert isinstance(surface, SurfaceMap)
+        return surface
 
     @property
     def properties(self) -> dict[str, PropertyMap]:
@@ -102,6 +158,8 @@ class Pipeline:
         """
         clock, live = StageClock(self.synchronize), runtime.current()
         T_world_camera = frame.require_pose()
+        if not self.settle([frame]):
+            raise EmptyFrame(f"{frame.label}: {_why_empty(frame, self.config.preprocess)}")
         if not live.warm:  # once, also where the first frames turn out to be of no use
             logger.info("compiling kernels (once a process)")
             live.warm = True
@@ -173,9 +231,9 @@ class Pipeline:
             try:
                 with clock.stage(f"{name} image"):
                     frame = source.add_to(frame)
-                if name not in self.maps:
-                    self.maps[name] = source.make_map(frame)
-                    self.groups = group_maps(self.maps.values())
+                if name not in self._maps:
+                    self._maps[name] = source.make_map(frame)
+                    self.groups = group_maps(self._maps.values())
             except FrameError as error:
                 lacking[name] = str(error)
                 frame = frame.without_image(name)
@@ -200,7 +258,8 @@ class Pipeline:
         early, an error of any kind too, is in the result, with all that was done until then; raises
         it, or DatasetError, only where not one frame could be used.
         """
-        log, failure, interrupted = RunLog(sequence), None, False
+        self.settle(_first_frames(sequence, stop) if not self._maps else ())
+        log, failure, interrupted = RunLog(sequence, self.config.preprocess), None, False
         for i, load in enumerate(load_ahead(sequence)):
             if interrupted := stop():
                 break
@@ -255,6 +314,26 @@ class Pipeline:
             blocks=blocks,
             flush=flush,
         )
+
+
+def _first_frames(sequence: Sequence[Frame], stop: Callable[[], bool]) -> Iterator[Frame]:
+    """Some of the first frames of a sequence, those that can be loaded."""
+    for i in range(0, min(len(sequence), SETTLE_STEP * SETTLE_FRAMES), SETTLE_STEP):
+        if stop():
+            return
+        try:
+            yield sequence[i]
+        except UniFusionError:  # `run` says so when it comes to it
+            continue
+
+
+def _sizes_sentence(config: Config, sight: Sight) -> str:
+    """Which voxel sizes were chosen, why, and how to choose others."""
+    surface, color = (100 * each.voxel_size for each in (config.surface, config.color))
+    return (
+        f"voxels of {surface:g} cm, {color:g} cm for colour: the first frames look {sight.depth:.2g} m far; "
+        "detail (fine, coarse) or voxel_size choose others"
+    )
 
 
 def _by_name(sources: Iterable[Source]) -> dict[str, Source]:

@@ -15,10 +15,13 @@ from .datasets.plausibility import guess_depth_scale
 from .datasets.pose_convention import guess_pose_convention, has_moved
 from .errors import DatasetError, FrameError, OutOfRange, PoseError, SizeMismatch, UniFusionError
 from .maps import Integration
+from .preprocessing import FARTHEST, PreprocessSettings
 from .types import Frame, Trajectory
 
 logger = logging.getLogger(__name__)
 
+MOST_OUTSIDE = 0.05  # of the readings may lie outside depth_min..depth_max unsaid
+SPARSE = 4  # one pixel of so many each way stands for all
 POSE_PAIRS = 5  # pairs of frames to try before giving up on checking the pose convention
 
 
@@ -75,8 +78,12 @@ class RunLog:
     trouble.
     """
 
-    def __init__(self, sequence: Sequence[Frame]) -> None:
+    def __init__(
+        self, sequence: Sequence[Frame], settings: PreprocessSettings | None = None
+    ) -> None:
         self.sequence, self.name = sequence, getattr(sequence, "name", "sequence")
+        self.settings = settings or PreprocessSettings()
+        self.readings = np.zeros(3, np.int64)  # nearer than is used, farther, all; of some pixels
         self.started = time.perf_counter()
         self.steps: list[StepResult] = []
         self.skipped: list[SkippedFrame] = []
@@ -101,6 +108,29 @@ class RunLog:
         self.scale_checked = bool((frame.depth > 0).any())
         if guess := guess_depth_scale(frame.depth, scale):
             self.warn(f"{frame.label}: {guess}")
+
+    def count_readings(self, frame: Frame) -> None:
+        """Note how many readings of a frame are too near or too far to be used."""
+        some = frame.depth[::SPARSE, ::SPARSE]
+        readings = some[(some > 0) & (some <= FARTHEST)]
+        near = np.count_nonzero(readings < self.settings.depth_min)
+        far = np.count_nonzero(readings > self.settings.depth_max)
+        self.readings += np.array([near, far, len(readings)])
+
+    def check_range(self) -> None:
+        """Warn where many readings were left out for their depth alone."""
+        near, far, total = self.readings.tolist()
+        if near + far <= MOST_OUTSIDE * total:
+            return
+        shares = [
+            f"{count / total:.0%} of the depth readings lie {where} (preprocess.{name}), and are left out"
+            for count, where, name in (
+                (near, f"nearer than {self.settings.depth_min:g} m", "depth_min"),
+                (far, f"beyond {self.settings.depth_max:g} m", "depth_max"),
+            )
+            if count > MOST_OUTSIDE / 2 * total
+        ]
+        self.warn("; ".join(shares))
 
     def check_poses(self, frame: Frame) -> None:
         """Warn if an early pair of frames shows that the poses follow another convention."""
@@ -127,6 +157,7 @@ class RunLog:
         self.steps.append(replace(step, milliseconds={"load": 1e3 * waited, **step.milliseconds}))
         self.poses.append((frame.timestamp, frame.require_pose()))
         self.check_poses(frame)
+        self.count_readings(frame)
 
     def add_flush(self, milliseconds: Mapping[str, float]) -> None:
         """Add what fusing the last window took to the last step."""
@@ -154,6 +185,7 @@ class RunLog:
         for error in (failure, failure and failure.__cause__):
             if error is not None:
                 error.__traceback__ = None  # it would hold the maps as long as the result lives
+        self.check_range()
         trajectory = Trajectory.of(
             [stamp for stamp, _ in self.poses],
             [step.index for step in self.steps],

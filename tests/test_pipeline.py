@@ -383,3 +383,19 @@ def test_after_warming_up_the_first_frame_compiles_nothing(frames):
     warm.step(frames[0])
     warm.extract_mesh()
     assert compiled() == before
+
+
+def test_readings_out_of_range_are_said_where_they_are_many(frames):
+    def said(**limits) -> list[str]:
+        settings = PreprocessSettings(**limits)
+        run = Pipeline(replace(CONFIG, preprocess=settings)).run(frames)
+        return [warning for warning in run.warnings if "depth readings lie" in warning]
+
+    depth = np.stack([frame.depth for frame in frames])
+    middle = float(np.median(depth[depth > 0]))
+    assert said() == []
+    (far,) = said(depth_max=middle)
+    share = int(far.partition("%")[0])
+    assert 40 <= share <= 60 and f"beyond {middle:g} m (preprocess.depth_max)" in far
+    (near,) = said(depth_min=middle)
+    assert f"nearer than {middle:g} m (preprocess.depth_min)" in near and "beyond" not in near

@@ -8,14 +8,15 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from ..config import Config, dump_config
+from ..config import Config
+from .commented_yaml import commented_yaml
 from .options import OPTIONAL, Settings
 from .terminal import DONE
 
 
 @dataclass(frozen=True)
 class ShowConfig:
-    """Print every setting, as it would be used, in YAML that --config reads back.
+    """Print every setting and what it means, as it would be used, in YAML that --config reads back.
 
     Settings come from the defaults, then from --config FILE, then from options. A file needs to
     hold only what differs.
@@ -28,5 +29,5 @@ class ShowConfig:
 
 def show_config(options: ShowConfig) -> int:
     """Settings -> YAML."""
-    print(dump_config(options.settings), end="")
+    print(commented_yaml(options.settings), end="")
     return DONE

@@ -20,13 +20,13 @@ from typing import Annotated, Any
 
 import tyro
 from tyro.conf import subcommand
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from ..config import Config, load_config
 from ..errors import FileError, UniFusionError, as_known, check_choice
 from .config import ShowConfig, show_config
 from .evaluate import METRICS, Evaluate
 from .export import Export, export
+from .help_texts import few_settings, no_settings, whole_sentences, with_long_names
 from .info import Info, info
 from .interrupts import INTERRUPTED
 from .mesh import ExtractMesh, extract_mesh
@@ -128,7 +128,7 @@ def _say_commands(prog: str, description: str, commands: Commands, arguments: li
         ]
         for name, (options, _) in commands.items()
     )
-    with _settings_left_out():
+    with no_settings(), whole_sentences():
         every: Any = reduce(or_, kinds)
         tyro.cli(every, prog=prog, description=description, args=arguments)
 
@@ -136,10 +136,12 @@ def _say_commands(prog: str, description: str, commands: Commands, arguments: li
 def _parse(prog: str, options: type, arguments: list[str]) -> Any:
     """The options of a command; the file that --config names gives the defaults of the settings."""
     if "settings" not in options.__dataclass_fields__:
-        return tyro.cli(options, prog=prog, args=arguments)
-    if {"-h", "--help"} & set(arguments) and options is not ShowConfig:
-        with _settings_left_out():
+        with whole_sentences():
             return tyro.cli(options, prog=prog, args=arguments)
+    if {"-h", "--help"} & set(arguments) and options is not ShowConfig:
+        with few_settings(), whole_sentences():
+            return tyro.cli(options, prog=prog, args=arguments)
+    arguments = with_long_names(arguments)
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     finder.add_argument("--config", nargs="?")
     file = finder.parse_known_args(arguments)[0].config
@@ -149,19 +151,7 @@ def _parse(prog: str, options: type, arguments: list[str]) -> Any:
         for field in dataclasses.fields(options)
         if field.default is field.default_factory is dataclasses.MISSING
     }
-    return tyro.cli(
-        options, prog=prog, args=arguments, default=options(**required, settings=settings)
-    )
-
-
-def _settings_left_out() -> ConstructorRegistry:
-    """While it is entered, settings have no options: help would list a hundred, which `unifusion
-    config --help` does already.
-    """
-    registry = ConstructorRegistry()
-
-    @registry.struct_rule
-    def without_fields(info: StructTypeInfo) -> StructConstructorSpec | None:
-        return StructConstructorSpec(Config, ()) if info.type is Config else None
-
-    return registry
+    with whole_sentences():
+        return tyro.cli(
+            options, prog=prog, args=arguments, default=options(**required, settings=settings)
+        )

@@ -34,7 +34,9 @@ class Query:
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """Results folder of `unifusion understand`."""
-    texts: Annotated[Positional[tuple[str, ...]], arg(metavar="TEXT...")]
+    texts: Annotated[
+        Positional[tuple[str, ...]], arg(metavar="TEXT...", help_behavior_hint="(one or more)")
+    ]
     """What to look for."""
     negative: Annotated[
         UseAppendAction[tuple[str, ...]],

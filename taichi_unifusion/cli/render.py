@@ -44,7 +44,9 @@ class Render:
     `folder` reads; with --depth and --normals also depth/, in millimetres, and normals/.
     """
 
-    dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...")]
+    dirs: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="(one or more)")
+    ]
     """Results folders of `unifusion`, or mesh files; several are shown side by side."""
     out: Annotated[Path, arg(metavar="FILE.mp4|DIR")]
     """Where to write: a video (.mp4, .mkv, .mov; with the extra `video`), or a folder for pictures."""

@@ -37,7 +37,9 @@ class View:
     here.
     """
 
-    dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...")]
+    dirs: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="DIR...", help_behavior_hint="(one or more)")
+    ]
     """Results folders of `unifusion`, or mesh files."""
     overlay: FlagCreatePairsOff[bool] = False
     """Lay several results over one another instead of side by side."""

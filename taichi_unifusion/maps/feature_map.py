@@ -68,7 +68,7 @@ class FeatureMap(BaseMap[FeatureSettings]):
         settings: FeatureSettings | None = None,
         **overrides: Any,
     ) -> None:
-        settings = dataclasses.replace(settings or FeatureSettings(), **overrides)
+        settings = dataclasses.replace(settings or FeatureSettings(), **overrides).sized
         check_channels(f"feature map '{name}'", channels, MAX_FEATURE_CHANNELS)
         # the first eigenfunction is nearly constant: the mean replaces it, the other rank - 1 stay
         self.rank = settings.encoder.rank - 1

@@ -46,7 +46,7 @@ class PropertyMap(RegressionMap[PropertySettings]):
         settings: PropertySettings | None = None,
         **overrides: Any,
     ) -> None:
-        settings = dataclasses.replace(settings or PropertySettings(), **overrides)
+        settings = dataclasses.replace(settings or PropertySettings(), **overrides).sized
         check_channels(f"property map '{name}'", channels, MAX_PROPERTY_CHANNELS)
         super().__init__(name, channels, settings, property_layout(channels, settings))
         self.binner = Binner(self.grid, settings.voxel_size, channels)

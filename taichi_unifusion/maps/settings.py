@@ -4,8 +4,8 @@ map.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 from ..errors import InputError, check_choice, check_range, shortened
 from .encoding import EncoderSettings
@@ -14,6 +14,7 @@ MAX_RESOLUTION = 32  # mesh cells along a voxel's edge
 MAX_WINDOW = 31  # frames that are fused at once: a voxel has a bit for each
 # of a map: kernels unroll over it, and with more would compile for minutes, deaf to Ctrl-C
 MAX_RANK = 64
+LEAST_VOXEL, LARGEST_VOXEL = 1e-4, 100.0  # [m]
 MAX_FEATURE_RANK = 20  # of a map of features: its kernels unroll over it
 # of a map of a property: its kernels unroll over them, and compile for half a minute
 MAX_PROPERTY_CHANNELS = 64
@@ -21,12 +22,20 @@ MAX_FEATURE_CHANNELS = 8192
 MAX_NAME = 200  # letters of a map's name
 
 
+def check_voxel_size(size: float) -> None:
+    """Raise InputError unless a voxel may be so large [m]; 0 stands for a size that is not chosen yet."""
+    if size != 0:
+        check_range("voxel_size", size, LEAST_VOXEL, LARGEST_VOXEL, "metres")
+
+
 @dataclass(frozen=True)
 class MapSettings:
     """Settings that every Latent Implicit Map has."""
 
-    voxel_size: float = 0.05
-    """Voxel edge in metres; a latent describes a cube of twice this edge."""
+    voxel_size: float = 0.0
+    """Voxel edge in metres; a latent describes a cube of twice this edge. 0: 0.05 in a room, as
+    `detail` says; 0.05 for a map by itself.
+    """
     noise: float = 1.0
     """Observation noise d of the regression (Eq. 6) relative to the kernel's variance; larger is
     smoother.
@@ -46,8 +55,15 @@ class MapSettings:
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
     """The position encoding."""
 
+    usual_voxel_size = 0.05  # [m] not a setting: has no type
+
+    @property
+    def sized(self) -> Self:
+        """The same, with the usual voxel size where none is given."""
+        return self if self.voxel_size else replace(self, voxel_size=self.usual_voxel_size)
+
     def __post_init__(self) -> None:
-        check_range("voxel_size", self.voxel_size, 1e-4, 100, "metres")
+        check_voxel_size(self.voxel_size)
         check_range("noise", self.noise, 1e-9, 1e9)
         check_range("min_points", self.min_points, 1, 1_000_000)
         if self.margin not in (1, 2):
@@ -97,9 +113,12 @@ class SurfaceSettings(MapSettings):
 class PropertySettings(MapSettings):
     """Settings of a property map (Sec. IV-C)."""
 
-    voxel_size: float = 0.025
+    usual_voxel_size = 0.025
+
+    voxel_size: float = 0.0
     """Voxel edge in metres; a latent describes a cube of twice this edge. Smaller is sharper where
-    colour fits depth well.
+    colour fits depth well. 0: 0.025 for colour in a room, as `detail` says, and for other
+    properties what fits them; 0.025 for a map by itself.
     """
     noise: float = 0.1
     """Observation noise d of the regression (Eq. 18) relative to the kernel's variance; larger is
@@ -127,8 +146,12 @@ class PropertySettings(MapSettings):
 class FeatureSettings(MapSettings):
     """Settings of a map of high-dimensional features (Sec. IV-D)."""
 
-    voxel_size: float = 0.1
-    """Voxel edge in metres; a latent describes a cube of twice this edge."""
+    usual_voxel_size = 0.1
+
+    voxel_size: float = 0.0
+    """Voxel edge in metres; a latent describes a cube of twice this edge. 0: 0.1 in a room, as
+    `detail` says; 0.1 for a map by itself.
+    """
     noise: float = 1.0
     """Observation noise d of the regression (Eq. 6) for one feature pixel, relative to the kernel's
     variance.

@@ -112,6 +112,8 @@ def describe(path: object, manifest: Mapping[str, Any]) -> MapDescription:
         kind = exact(manifest.get("kind"), Literal[tuple(KINDS)], "kind")
         known = KINDS[kind]
         settings = _settings(known.settings, manifest.get("settings"), "settings")
+        if not settings.voxel_size:  # one that is not chosen yet: no map has that
+            raise InputError("settings: voxel_size is missing or 0")
         description = MapDescription(
             kind,
             exact(manifest.get("name"), str, "name"),

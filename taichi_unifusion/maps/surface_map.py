@@ -42,7 +42,7 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
     settings_type = SurfaceSettings
 
     def __init__(self, settings: SurfaceSettings | None = None, **overrides: Any) -> None:
-        settings = dataclasses.replace(settings or SurfaceSettings(), **overrides)
+        settings = dataclasses.replace(settings or SurfaceSettings(), **overrides).sized
         layout = surface_layout(settings)
         super().__init__("surface", 1, settings, layout, [EVIDENCE] * settings.carve)
         beside = settings.sample_distance

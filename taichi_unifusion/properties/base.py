@@ -40,6 +40,7 @@ class SurfaceProperty:
     function: Callable[[Frame], NDArray]
     look: Look = field(default_factory=Look)
     settings: PropertySettings | None = None  # of its map; None: the configuration's `property_map`
+    voxel_size: float = 0.1  # [m] of its map in a room, where its settings say none
 
     def __post_init__(self) -> None:
         taken = self.name in RESERVED or self.name.startswith(RESERVED_BEGINNINGS)
@@ -53,15 +54,20 @@ class SurfaceProperty:
                 f"property '{self.name}': channels must be at least 1, got {self.channels}"
             )
 
-    def with_settings(self, settings: PropertySettings) -> SurfaceProperty:
-        """The same, with these settings of its map where it has none of its own."""
-        return self if self.settings is not None else replace(self, settings=settings)
+    def with_settings(self, settings: PropertySettings, scale: float = 1.0) -> SurfaceProperty:
+        """The same, with these settings of its map where it has none of its own, and with its usual
+        voxel size, times `scale`, where they have none.
+        """
+        settings = self.settings or settings
+        size = settings.voxel_size or float(f"{scale * self.voxel_size:.6g}")
+        return replace(self, settings=replace(settings, voxel_size=size))
 
     def make_map(self, frame: Frame | None = None) -> PropertyMap:
         """An empty map for the property."""
         from ..maps import PropertyMap  # Taichi starts with the first map, not with a property
 
-        return PropertyMap(self.name, self.channels, self.settings)
+        settings = self.with_settings(PropertySettings()).settings
+        return PropertyMap(self.name, self.channels, settings)
 
     def add_to(self, frame: Frame) -> Frame:
         """The frame with its image of the property; raises as `image`."""

@@ -15,6 +15,7 @@ from ..types import Frame
 from .base import SurfaceProperty
 
 SUFFIXES = (".npy", ".png", ".jpg", ".jpeg")
+VOXEL_SIZE = 0.05  # [m] of what nothing is known of
 
 
 def folder_images(
@@ -47,4 +48,4 @@ def folder_images(
         return values
 
     look = Look(colormap, None if low is None or high is None else (low, high), file.name)
-    return SurfaceProperty("images", channels, function, look)
+    return SurfaceProperty("images", channels, function, look, voxel_size=VOXEL_SIZE)

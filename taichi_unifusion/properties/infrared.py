@@ -13,6 +13,7 @@ from ..types import Frame
 from .base import SurfaceProperty
 
 FULL_SCALE = 65535.0  # largest infrared value of a data set
+VOXEL_SIZE = 0.02  # [m] as sharp as what is drawn on things
 KNEE = 100.0  # units below which the logarithmic curve is nearly linear: about a sensor's noise
 
 
@@ -29,7 +30,11 @@ def log_infrared() -> SurfaceProperty:
         return np.log1p(_infrared_of(frame) / KNEE) * scale
 
     return SurfaceProperty(
-        "infrared", 1, function, Look("inferno", None, "infrared brightness (logarithmic, 0..1)")
+        "infrared",
+        1,
+        function,
+        Look("inferno", None, "infrared brightness (logarithmic, 0..1)"),
+        voxel_size=VOXEL_SIZE,
     )
 
 
@@ -44,7 +49,11 @@ def linear_infrared(*, low: float = 0.0, high: float = FULL_SCALE) -> SurfacePro
         return np.clip((_infrared_of(frame) - np.float32(low)) / np.float32(high - low), 0, 1)
 
     return SurfaceProperty(
-        "infrared", 1, function, Look("inferno", None, f"infrared ({low:g}..{high:g} as 0..1)")
+        "infrared",
+        1,
+        function,
+        Look("inferno", None, f"infrared ({low:g}..{high:g} as 0..1)"),
+        voxel_size=VOXEL_SIZE,
     )
 
 

@@ -13,6 +13,7 @@ from .base import SurfaceProperty
 
 # relative depth step beyond which two pixels lie on different surfaces
 FARTHEST_JUMP = 0.03
+VOXEL_SIZE = 0.05  # [m] as the surface
 
 
 def surface_normal() -> SurfaceProperty:
@@ -25,7 +26,11 @@ def surface_normal() -> SurfaceProperty:
         return normals @ frame.T_world_camera[:3, :3].T.astype(np.float32)
 
     return SurfaceProperty(
-        "normal", 3, function, Look(range=(-1.0, 1.0), label="normal x, y, z as red, green, blue")
+        "normal",
+        3,
+        function,
+        Look(range=(-1.0, 1.0), label="normal x, y, z as red, green, blue"),
+        voxel_size=VOXEL_SIZE,
     )
 
 
@@ -45,7 +50,11 @@ def mean_curvature(*, radius: int = 6) -> SurfaceProperty:
         )
 
     return SurfaceProperty(
-        "curvature", 1, function, Look("diverging", None, "mean curvature [1/m]")
+        "curvature",
+        1,
+        function,
+        Look("diverging", None, "mean curvature [1/m]"),
+        voxel_size=VOXEL_SIZE,
     )
 
 

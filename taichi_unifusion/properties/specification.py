@@ -19,9 +19,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import get_type_hints
 
-from ..config import Config
-from ..errors import InputError, convert, did_you_mean
-from ..maps.settings import PropertySettings
+from ..errors import InputError, check_range, convert, did_you_mean
+from ..maps.settings import LARGEST_VOXEL, LEAST_VOXEL, PropertySettings
 from .base import SurfaceProperty
 from .registry import PROPERTIES
 
@@ -77,8 +76,16 @@ def make_property(text: str, settings: PropertySettings | None = None) -> Surfac
         for key, value in options.items()
         if key in of_map
     }
+    if "voxel_size" in changes:
+        check_range(
+            f"property '{text}': voxel_size",
+            changes["voxel_size"],
+            LEAST_VOXEL,
+            LARGEST_VOXEL,
+            "metres",
+        )
     made = maker(Path(file).expanduser(), **given) if file else maker(**given)
-    settings = dataclasses.replace(settings or Config().property_map, **changes)
+    settings = dataclasses.replace(settings or PropertySettings(), **changes)
     return dataclasses.replace(made, name=options.get("name", name), settings=settings)
 
 

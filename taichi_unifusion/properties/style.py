@@ -17,6 +17,7 @@ from ..types import Frame
 from .base import SurfaceProperty, color_of
 
 LOOK = Look()
+VOXEL_SIZE = 0.02  # [m] contours and strokes are finer than other properties
 CONTOUR_WIDTH = 2.0  # [pixels]
 FAINTEST = 0.017  # smallest change of brightness a pixel that gives a contour
 OVERSHOOT = 10.0  # an output this many times beyond the stated range means that the range is wrong
@@ -48,7 +49,7 @@ def painting_style(
         strength = np.sqrt((down**2 + right**2).max(axis=2, keepdims=True))
         return flat * (1 - np.clip(contours * (strength - FAINTEST), 0, 1))
 
-    return SurfaceProperty("style", 3, function, LOOK)
+    return SurfaceProperty("style", 3, function, LOOK, voxel_size=VOXEL_SIZE)
 
 
 def opencv_style(*, smoothness: float = 60.0, detail: float = 0.45) -> SurfaceProperty:
@@ -66,7 +67,7 @@ def opencv_style(*, smoothness: float = 60.0, detail: float = 0.45) -> SurfacePr
         )
         return _as_rgb(painted)
 
-    return SurfaceProperty("style", 3, function, LOOK)
+    return SurfaceProperty("style", 3, function, LOOK, voxel_size=VOXEL_SIZE)
 
 
 def sketch_style(
@@ -83,7 +84,7 @@ def sketch_style(
         )
         return _as_rgb(colored if color else cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
 
-    return SurfaceProperty("style", 3, function, LOOK)
+    return SurfaceProperty("style", 3, function, LOOK, voxel_size=VOXEL_SIZE)
 
 
 def network_style(
@@ -124,7 +125,7 @@ def network_style(
             (values if order == "rgb" else values[..., ::-1]) / np.float32(output_scale), 0, 1
         )
 
-    return SurfaceProperty("style", 3, function, LOOK)
+    return SurfaceProperty("style", 3, function, LOOK, voxel_size=VOXEL_SIZE)
 
 
 def _bgr_of(frame: Frame) -> NDArray[np.uint8]:

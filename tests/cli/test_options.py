@@ -7,12 +7,14 @@ import re
 import shutil
 
 import pytest
+import yaml
 from tiny_recording import FLAGS, make_frames, write_folder
 
 from taichi_unifusion import datasets
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.cli import options
 from taichi_unifusion.cli.options import RecordingOptions, open_recording, source_of
+from taichi_unifusion.config import Config, load_config
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.results import read_run
 
@@ -128,3 +130,55 @@ def test_evaluation_takes_a_recording_of_another_format_with_its_options(made, t
     assert cli.main([*arguments, "--option", "noise=false"]) == 2
     assert "option 'noise' is unknown for format 'folder'" in capsys.readouterr().err
     assert cli.main([*arguments, "--option", "depth_scale=1000"]) == 0
+
+
+COMMANDS = [
+    ["reconstruct"],
+    ["transfer"],
+    ["understand"],
+    ["query"],
+    ["segment"],
+    ["view"],
+    ["render"],
+    ["mesh"],
+    ["export"],
+    ["info"],
+    ["config"],
+    *(["evaluate", metric] for metric in ("surface", "trajectory", "rendering", "segmentation")),
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_help_is_whole_sentences_without_empty_defaults(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")  # no line is wrapped: a break is one in the text itself
+    assert cli.main([*command, "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert "(default: )" not in shown and "(default: False)" not in shown
+    entries = [line.strip("│ ") for line in shown.splitlines() if line.startswith("│ ")]
+    for entry in entries[1:]:  # the first is -h
+        if entry and entry.strip("─"):
+            assert entry.rstrip()[-1] in ".)" or entry.startswith(("--", "-h")), entry
+
+
+def test_help_lists_first_what_people_need_first(capsys):
+    cli.main(["reconstruct", "--help"])
+    flags = re.findall(r"^│ (--\w[\w-]+)", capsys.readouterr().out, re.MULTILINE)
+    assert flags[:4] == ["--detail", "--voxel-size", "--depth-max", "--device"]
+
+
+def test_short_names_of_settings_are_the_settings(capsys):
+    assert cli.main(["config", "--depth-max", "3", "--depth-min=0.2"]) == 0
+    values = yaml.safe_load(capsys.readouterr().out)
+    assert (values["preprocess"]["depth_max"], values["preprocess"]["depth_min"]) == (3.0, 0.2)
+
+
+def test_config_explains_every_setting(capsys, tmp_path):
+    assert cli.main(["config", "--voxel-size", "0.02"]) == 0
+    shown = capsys.readouterr().out
+    lines = shown.splitlines()
+    for i, line in enumerate(lines):
+        if line and not line.lstrip().startswith("#"):
+            assert lines[i - 1].lstrip().startswith("#"), line
+    file = tmp_path / "all.yaml"
+    file.write_text(shown)
+    assert load_config(file) == Config(voxel_size=0.02)

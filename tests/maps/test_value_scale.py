@@ -104,7 +104,7 @@ class Carried:
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def with_settings(self, settings):
+    def with_settings(self, settings, scale=1.0):
         return self
 
     def make_map(self, frame=None):

@@ -273,10 +273,8 @@ def test_text_names_method_options_and_settings_of_the_map():
     assert made.settings == dataclasses.replace(
         base, voxel_size=0.05, blend=False, min_points=9, prior="zero"
     )
-    assert (
-        make_property("saliency").settings == Config().property_map
-        and Config().property_map.voxel_size == 0.1
-    )
+    assert make_property("saliency").settings == Config().property_map
+    assert make_property("saliency").make_map().voxel_size == 0.1
     assert make_property("saliency,voxel_size=0.2").settings.voxel_size == 0.2
     assert make_property("saliency=voxel_size=0.2").settings.voxel_size == 0.2
 
