@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from itertools import pairwise
 
 import pytest
 import yaml
@@ -150,19 +151,23 @@ COMMANDS = [
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_help_is_whole_sentences_without_empty_defaults(command, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "400")  # no line is wrapped: a break is one in the text itself
+    monkeypatch.setenv("COLUMNS", "90")
     assert cli.main([*command, "--help"]) == 0
     shown = capsys.readouterr().out
     assert "(default: )" not in shown and "(default: False)" not in shown
-    entries = [line.strip("│ ") for line in shown.splitlines() if line.startswith("│ ")]
-    for entry in entries[1:]:  # the first is -h
-        if entry and entry.strip("─"):
-            assert entry.rstrip()[-1] in ".)" or entry.startswith(("--", "-h")), entry
+    rows = [line.strip("│|").rstrip() for line in shown.partition("options")[2].splitlines()]
+    width, breaks = max(map(len, rows)), 0
+    for row, after in pairwise(rows):
+        indent = len(row) - len(row.lstrip())
+        if indent > 4 and after[:indent].isspace() and after[indent : indent + 1].strip():
+            breaks += 1  # where the next word does not fit any more
+            assert len(row) + 1 + len(after.split()[0]) > width - 1, f"{row!r} {after!r}"
+    assert breaks > 10 or command != ["config"]
 
 
 def test_help_lists_first_what_people_need_first(capsys):
     cli.main(["reconstruct", "--help"])
-    flags = re.findall(r"^│ (--\w[\w-]+)", capsys.readouterr().out, re.MULTILINE)
+    flags = re.findall(r"^[│| ]? *(--\w[\w-]+)", capsys.readouterr().out, re.MULTILINE)
     assert flags[:4] == ["--detail", "--voxel-size", "--depth-max", "--device"]
 
 
