@@ -323,7 +323,7 @@ def _first_frames(sequence: Sequence[Frame], stop: Callable[[], bool]) -> Iterat
             return
         try:
             yield sequence[i]
-        except UniFusionError:  # `run` says so when it comes to it
+        except Exception:  # noqa: BLE001 - `run` says so when it comes to it
             continue
 
 
