@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from ..datasets import Dataset, open_dataset
+from ..datasets import Dataset, known_format, open_dataset
 from ..errors import FrameError, InputError
 from ..results.tables import format_table
 from .color_camera import CHOICES as COLOR_CHOICES
@@ -166,6 +166,7 @@ def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Ru
             "rendering: give the recording to compare the mesh with: unifusion evaluate rendering MESH FORMAT "
             "PATH"
         )
+    format = known_format(format, options.path)
     given = merged_options(format, given, options.option)
     if run is None:
         return open_dataset(format, options.path, **given), None

@@ -26,6 +26,7 @@ from ..errors import FileError, UniFusionError, as_known, check_choice
 from .config import ShowConfig, show_config
 from .evaluate import METRICS, Evaluate
 from .export import Export, export
+from .formats import ShowFormats, show_formats
 from .help_texts import few_settings, no_settings, whole_sentences, with_long_names
 from .info import Info, info
 from .interrupts import INTERRUPTED
@@ -60,6 +61,7 @@ COMMANDS: Commands = {
     "mesh": (ExtractMesh, extract_mesh),
     "export": (Export, export),
     "info": (Info, info),
+    "formats": (ShowFormats, show_formats),
     "config": (ShowConfig, show_config),
     "evaluate": (Evaluate, METRICS),
 }

@@ -7,6 +7,7 @@ A command nests them, with `name=""` so that their flags have no prefix.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +15,14 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from ..config import Config
-from ..datasets import FORMATS, Dataset, format_options, open_dataset, parse_options
+from ..datasets import (
+    FORMATS,
+    Dataset,
+    format_options,
+    known_format,
+    open_dataset,
+    parse_options,
+)
 from ..errors import DatasetError, InputError
 from ..results.record import ColorRecord, Source
 from ..tracking import Mode
@@ -51,7 +59,11 @@ class RecordingOptions:
     """Which frames of which recording, and how to read it."""
 
     format: Annotated[
-        Positional[str], arg(metavar="FORMAT", help=f"The kind of recording: {', '.join(FORMATS)}.")
+        Positional[str],
+        arg(
+            metavar="FORMAT",
+            help=f"The kind of recording: {', '.join(FORMATS)}; or auto, which looks at the files.",
+        ),
     ]
     path: Annotated[
         Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint="(synthetic needs none)")
@@ -85,6 +97,11 @@ class RecordingOptions:
     """
     strict: FlagCreatePairsOff[bool] = False
     """Stop at the first frame that cannot be used, instead of skipping it."""
+
+    @cached_property
+    def kind(self) -> str:
+        """The format, and of "auto" the one that the files are of; DatasetError where none is."""
+        return known_format(self.format, self.path)
 
 
 @dataclass(frozen=True)
@@ -173,7 +190,7 @@ def open_recording(options: RecordingOptions) -> Dataset:
     """All frames from --start to --end, whatever --every says; raises DatasetError if there are
     none.
     """
-    recording = open_dataset(options.format, options.path, **reading_options(options))
+    recording = open_dataset(options.kind, options.path, **reading_options(options))
     asked = frames_asked(recording, options.start, options.end, options.every)
     return recording[asked.start : options.end]
 
@@ -181,7 +198,7 @@ def open_recording(options: RecordingOptions) -> Dataset:
 def source_of(options: RecordingOptions, frames: int, color: ColorRecord | None = None) -> Source:
     """What the record of a run keeps of the recording; `frames` were asked for."""
     return Source(
-        format=options.format,
+        format=options.kind,
         path=str(options.path or ""),
         start=options.start,
         end=options.end,
@@ -204,9 +221,9 @@ def reading_options(options: RecordingOptions) -> dict[str, Any]:
         "trajectory": options.camera_path,
     }
     given = {name: value for name, value in flags.items() if value is not None}
-    if options.camera_path is not None and "trajectory" not in format_options(options.format):
-        raise InputError(f"--camera-path: format '{options.format}' has poses of its own; drop it")
-    return merged_options(options.format, given, options.option)
+    if options.camera_path is not None and "trajectory" not in format_options(options.kind):
+        raise InputError(f"--camera-path: format '{options.kind}' has poses of its own; drop it")
+    return merged_options(options.kind, given, options.option)
 
 
 def merged_options(format: str, given: dict[str, Any], texts: tuple[str, ...]) -> dict[str, Any]:

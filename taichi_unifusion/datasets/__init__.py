@@ -4,7 +4,9 @@ indexed and sliced.
 
 from __future__ import annotations
 
+import ast
 import inspect
+import logging
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -20,6 +22,8 @@ from .dataset import Dataset, DatasetView
 if TYPE_CHECKING:
     from .color_camera import ColorCamera
     from .color_estimation import ColorEstimate, estimate_color_camera
+
+logger = logging.getLogger(__name__)
 
 FORMATS = {  # name -> module here, what opens a recording
     "synthetic": ("synthetic", "SyntheticRoom"),
@@ -39,6 +43,8 @@ FORMATS = {  # name -> module here, what opens a recording
     "realsense": ("realsense", "open_realsense"),
     "rosbag": ("rosbag", "open_rosbag"),
 }
+
+AUTO = "auto"  # instead of a format: the one that the files are of
 
 SENTENCES = {  # what an option of open_dataset means, the same in every format that has it
     "align": "The camera whose pixels the frames have, depth or color; the paper's is color.",
@@ -104,9 +110,11 @@ class FormatOption:
 def open_dataset(format: str, path: str | Path | None = None, **options: Any) -> Dataset:
     """Open the recording at `path`; frames are read when indexed.
 
-    `format_options` says which options a format has. Raises DatasetError for an unknown format, a
-    path that does not exist or holds no such recording, InputError for an unknown option.
+    With the format "auto" the files say which it is. `format_options` says which options a format
+    has. Raises DatasetError for an unknown format, a path that does not exist or holds no such
+    recording, InputError for an unknown option.
     """
+    format = known_format(format, path)
     opener = _opener(format)
     known = format_options(format)
     for option in options:
@@ -119,6 +127,31 @@ def open_dataset(format: str, path: str | Path | None = None, **options: Any) ->
     if not os.path.exists(path):  # unlike Path.exists it answers for any name
         raise DatasetError(f"{path}: no such file or folder")
     return opener(path, **options)
+
+
+def known_format(format: str, path: str | Path | None) -> str:
+    """The format itself, or of "auto" the one that the files at `path` are of.
+
+    Raises DatasetError where none is recognised or several could be meant.
+    """
+    if format != AUTO:
+        return format
+    if path is None:
+        raise DatasetError(f"format '{AUTO}' needs the path of a recording")
+    from .detection import find_format
+
+    found = find_format(Path(path).expanduser(), FORMATS)
+    logger.info("format %s, known by %s", found.format, found.sign)
+    return found.format
+
+
+def format_layout(format: str) -> str:
+    """What a recording of a format is made of, in words: the docstring of its module, which is not
+    imported for it. DatasetError for an unknown format.
+    """
+    _opener_name(format)
+    source = Path(__file__).with_name(f"{FORMATS[format][0]}.py").read_text(encoding="utf-8")
+    return ast.get_docstring(ast.parse(source)) or ""
 
 
 def format_options(format: str) -> dict[str, FormatOption]:
@@ -159,12 +192,17 @@ def parse_options(format: str, texts: Iterable[str]) -> dict[str, Any]:
 
 def _opener(format: str) -> Callable[..., Dataset]:
     """The function or class that opens recordings of a format."""
+    module, name = _opener_name(format)
+    return getattr(import_module(f".{module}", __name__), name)
+
+
+def _opener_name(format: str) -> tuple[str, str]:
+    """Its module here and its name."""
     if format not in FORMATS:
         raise DatasetError(
-            f"format '{format}' is unknown{did_you_mean(format, FORMATS)}; formats: {', '.join(FORMATS)}"
+            f"format '{format}' is unknown{did_you_mean(format, FORMATS)}; formats: {', '.join(FORMATS)}, or auto"
         )
-    module, name = FORMATS[format]
-    return getattr(import_module(f".{module}", __name__), name)
+    return FORMATS[format]
 
 
 def _check_option(name: str, format: str, known: Iterable[str]) -> None:
