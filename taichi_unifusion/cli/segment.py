@@ -5,6 +5,7 @@ legend.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -107,9 +108,7 @@ def read_labels_file(path: Path) -> dict[int, str]:
         raise FileError(f"{path}: not a text file") from None
     lines = [" ".join(line.split()) for line in lines]
     lines = [line for line in lines if line and not line.startswith("#")]
-    numbered = [
-        line.partition(" ") for line in lines if line.split(" ")[0].isdecimal() and " " in line
-    ]
+    numbered = [line.partition(" ") for line in lines if re.fullmatch(r"[0-9]{1,9} .*", line)]
     if len(numbered) == len(lines):
         names = [(int(number), name) for number, _, name in numbered]
     else:

@@ -107,7 +107,8 @@ class Recording(CameraPair):
         """Read frame `index`; FrameError (PoseError, SizeMismatch) names the faulty file."""
         files = self.frames[index]
         T_world_camera = files.pose.checked() if files.pose else None
-        depth = read_depth(files.depth, self.depth_scale, self.invalid)
+        size = self.camera.width, self.camera.height
+        depth = read_depth(files.depth, self.depth_scale, self.invalid, size)
         frame = Frame(
             depth,
             self.camera,

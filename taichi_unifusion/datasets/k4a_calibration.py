@@ -7,13 +7,13 @@ sensor in its own way.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError, PoseError
+from ..files.json_text import parse_json
 from ..types import check_rigid
 from .depth_camera import make_camera
 from .depth_registration import MAX_RADIUS, LensCamera
@@ -52,7 +52,7 @@ def read_calibration(
     try:
         cameras = {
             camera["Location"]: camera
-            for camera in json.loads(data)["CalibrationInformation"]["Cameras"]
+            for camera in parse_json(data)["CalibrationInformation"]["Cameras"]
         }
         depth = _lens(cameras[DEPTH_LOCATION], source, depth_size, *DEPTH_MODES[depth_size])
         color = (

@@ -10,13 +10,13 @@ fy = 600, cx 599.5, cy 339.5.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import DatasetError
 from ..files.atomic import read_bytes
 from ..files.frame_files import file_of, first_existing, numbered_files
+from ..files.json_text import parse_json
 from ..files.trajectories import REPLICA, Pose, read_pose_rows
 from ..types import PinholeCamera
 from .depth_camera import check_size, make_camera
@@ -95,7 +95,7 @@ def _read_parameters(folder: Path) -> tuple[PinholeCamera, float]:
     if file is None:
         return DEFAULT_CAMERA, DEPTH_SCALE
     try:
-        values = json.loads(read_bytes(file).decode("utf-8-sig"))
+        values = parse_json(read_bytes(file).decode("utf-8-sig"))
         values = values.get("camera", values)
         w, h, fx, fy, cx, cy = (float(values[key]) for key in ("w", "h", "fx", "fy", "cx", "cy"))
         scale = float(values.get("scale", DEPTH_SCALE))

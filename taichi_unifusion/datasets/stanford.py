@@ -10,7 +10,6 @@ Equirectangular images (`pano/`) are not read.
 
 from __future__ import annotations
 
-import json
 import re
 from copy import copy
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from ..errors import DatasetError, FrameError, InputError, PoseError, did_you_me
 from ..files.atomic import read_bytes
 from ..files.frame_files import list_names
 from ..files.images import INVALID_DEPTH, read_color, read_depth
+from ..files.json_text import parse_json
 from ..types import Frame, PinholeCamera, check_rigid
 from .dataset import Dataset
 from .file_recording import check_depth_scale
@@ -134,7 +134,7 @@ class StanfordArea(Dataset):
 def _read_pose(file: Path) -> dict[str, NDArray[np.float64]]:
     """The matrices of a pose file."""
     try:
-        values = json.loads(read_bytes(file).decode("utf-8-sig"))
+        values = parse_json(read_bytes(file).decode("utf-8-sig"))
         keys = ("camera_rt_matrix", "camera_k_matrix")
         return {key: np.array(values[key], np.float64) for key in keys}
     except KeyError as error:

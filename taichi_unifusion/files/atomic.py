@@ -32,9 +32,16 @@ def file_error(verb: str, path: str | os.PathLike[str], error: OSError) -> FileE
     return FileError(f"{path}: cannot {verb}: {reason}")
 
 
+def check_name(path: str | os.PathLike[str]) -> None:
+    """Raise FileError for a name that no file can have."""
+    if "\0" in os.fspath(path):
+        raise FileError(f"{os.fspath(path)[:200]!r}: a file's name cannot hold a zero byte")
+
+
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """The whole content of a file; raises FileError where it is missing or cannot be read."""
     path = Path(path)
+    check_name(path)
     try:
         return path.read_bytes()
     except FileNotFoundError:
@@ -48,6 +55,7 @@ def check_writable(folder: str | os.PathLike[str]) -> Path:
     cannot hold results.
     """
     folder = Path(folder)
+    check_name(folder)
     probe = folder / f".{secrets.token_hex(4)}.tmp"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -96,6 +104,7 @@ def _followed(path: Path) -> Path:
     """
     if path.is_symlink() and path.lstat().st_uid not in (os.geteuid(), 0):
         raise FileError(f"{path}: cannot write: this is a link of another user; remove it first")
+    check_name(path)
     return Path(os.path.realpath(path))
 
 

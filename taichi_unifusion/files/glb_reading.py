@@ -3,7 +3,6 @@ colours as sRGB."""
 
 from __future__ import annotations
 
-import json
 import struct
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from ..types import Mesh
 from .glb import GENERATOR, TYPES
 from .images import decode_color
+from .json_text import parse_json
 from .srgb import linear_to_srgb
 from .texture import Texture
 
@@ -29,7 +29,7 @@ def parse_own_glb(data: bytes) -> tuple[Mesh, Texture | None] | None:
     if data[:4] != b"glTF":
         return None
     (size,) = struct.unpack_from("<I", data, 12)
-    said = json.loads(data[20 : 20 + size])
+    said = parse_json(data[20 : 20 + size])
     if said["asset"].get("generator") != GENERATOR:
         return None
     if any(entry["componentType"] not in NUMBERS for entry in said["accessors"]):

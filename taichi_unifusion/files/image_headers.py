@@ -16,6 +16,8 @@ from ..errors import FrameError
 
 # three times an 8k image; a larger size means a damaged or hostile header
 MAX_PIXELS = 100_000_000
+MAX_BYTES = 268_435_456  # of a decoded image
+PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}  # as they are decoded, by colour type
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -30,15 +32,22 @@ PGM_HEADER = re.compile(
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Kind ("PNG", "JPEG", "PGM") and size [pixels] as the header states them; the pixel data begin
-    after `data_offset`.
+    """Kind ("PNG", "JPEG", "PGM"), size [pixels], and bits and channels of a pixel once it is decoded,
+    as the header states them; the pixel data begin after `data_offset`.
     """
 
     kind: str
     width: int
     height: int
     data_offset: int
+    bits: int = 8  # of a channel, 8 or 16
+    channels: int = 1
     data_bytes: int = 0  # known for PGM only
+
+    @property
+    def decoded_bytes(self) -> int:
+        """Bytes of the decoded image."""
+        return self.width * self.height * self.channels * self.bits // 8
 
 
 def read_header(data: bytes, where: str) -> ImageHeader:
@@ -63,6 +72,11 @@ def read_header(data: bytes, where: str) -> ImageHeader:
         raise FrameError(
             f"{where}: the header says {header.width}x{header.height} pixels, refused (at most {MAX_PIXELS})"
         )
+    if header.decoded_bytes > MAX_BYTES:
+        raise FrameError(
+            f"{where}: the header says {header.width}x{header.height} pixels of {header.channels} times "
+            f"{header.bits} bits, {header.decoded_bytes / 1e6:.0f} MB, refused (at most {MAX_BYTES / 1e6:.0f})"
+        )
     return header
 
 
@@ -77,9 +91,9 @@ def check_whole(data: bytes, header: ImageHeader, where: str) -> None:
 def _png_header(data: bytes) -> ImageHeader | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         return None
-    return ImageHeader(
-        "PNG", int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), 8
-    )
+    width, height = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    bits, channels = 16 if data[24] == 16 else 8, PNG_CHANNELS.get(data[25])
+    return None if channels is None else ImageHeader("PNG", width, height, 8, bits, channels)
 
 
 def _png_is_whole(data: bytes, header: ImageHeader) -> str | None:
@@ -98,7 +112,7 @@ def _png_is_whole(data: bytes, header: ImageHeader) -> str | None:
 
 
 def _jpeg_header(data: bytes) -> ImageHeader | None:
-    size, at = None, 2
+    size, channels, at = None, 3, 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
         if marker == 0xFF:  # fill byte
@@ -107,13 +121,14 @@ def _jpeg_header(data: bytes) -> ImageHeader | None:
         if marker in JPEG_WITHOUT_LENGTH:
             at += 2
             continue
-        if marker in JPEG_START_OF_FRAME and at + 9 <= len(data):
+        if marker in JPEG_START_OF_FRAME and at + 9 < len(data):
             size = (
                 int.from_bytes(data[at + 7 : at + 9], "big"),
                 int.from_bytes(data[at + 5 : at + 7], "big"),
             )
+            channels = 1 if data[at + 9] == 1 else 3
         if marker == JPEG_START_OF_SCAN:
-            return ImageHeader("JPEG", *size, at) if size else None
+            return ImageHeader("JPEG", *size, at, 8, channels) if size else None
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return None
 
@@ -129,8 +144,9 @@ def _pgm_header(data: bytes) -> ImageHeader | None:
     if not match:
         return None
     width, height, maximum = map(int, match.groups())
+    bits = 16 if maximum > 255 else 8
     return ImageHeader(
-        "PGM", width, height, match.end(), width * height * (2 if maximum > 255 else 1)
+        "PGM", width, height, match.end(), bits, data_bytes=width * height * bits // 8
     )
 
 

@@ -8,7 +8,7 @@ becomes 8-bit silently.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import cv2
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError, SizeMismatch
 from .atomic import atomic_write
-from .image_headers import MAX_PIXELS, check_whole, read_header
+from .image_headers import MAX_PIXELS, ImageHeader, check_whole, read_header
 
 INVALID_DEPTH = (0, 65535)  # no reading; 65535 is also what 16 bits saturate at
 SAME_ASPECT = 0.01  # relative difference of width/height up to which colour is resized to depth
@@ -33,11 +33,7 @@ def read_color(path: Path, *, drop_alpha: bool = False) -> NDArray[np.uint8]:
 
 def decode_color(data: bytes, where: str, *, drop_alpha: bool = False) -> NDArray[np.uint8]:
     """The bytes of a PNG or JPEG file as (H, W, 3) RGB; `where` names them in messages."""
-    image = decode_image(data, where)
-    if image.dtype != np.uint8:
-        raise FrameError(
-            f"{where}: colour must be 8 bits a channel, got {image.dtype}; is this a depth image?"
-        )
+    image = decode_image(data, where, _check_color_header)
     channels = 1 if image.ndim == 2 else image.shape[2]
     if channels == 4 and drop_alpha:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGB), np.uint8)
@@ -50,17 +46,24 @@ def decode_color(data: bytes, where: str, *, drop_alpha: bool = False) -> NDArra
 
 
 def read_depth(
-    path: Path, depth_scale: float, invalid: Collection[int] = INVALID_DEPTH
+    path: Path,
+    depth_scale: float,
+    invalid: Collection[int] = INVALID_DEPTH,
+    size: tuple[int, int] | None = None,
 ) -> NDArray[np.float32]:
     """The depth image at `path` as (H, W) metres, 0 where there is no reading.
 
     PNG and PGM hold 16-bit integers, `depth_scale` units a metre, `invalid` among them. NPY holds
-    such integers, or floats, which are metres already.
+    such integers, or floats, which are metres already. With the `size` (width, height) of the camera,
+    an image of another is a SizeMismatch before it is decoded.
     """
-    if path.suffix.lower() != ".npy":
-        return depth_to_metres(
-            decode_image(_read_bytes(path), str(path)), str(path), depth_scale, invalid
+    if size is not None and (found := depth_file_size(path)) != size:
+        raise SizeMismatch(
+            f"{path}: depth is {found[0]}x{found[1]} but the camera is {size[0]}x{size[1]}"
         )
+    if path.suffix.lower() != ".npy":
+        image = decode_image(_read_bytes(path), str(path), _check_depth_header)
+        return depth_to_metres(image, str(path), depth_scale, invalid)
     array = np.array(_open_npy(path))
     if array.ndim == 2 and np.issubdtype(array.dtype, np.floating):
         depth = array.astype(np.float32)
@@ -74,6 +77,21 @@ def read_scaled_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
     if path.suffix.lower() == ".npy" and _open_npy(path).dtype.kind == "f":
         depth /= np.float32(depth_scale)
     return depth
+
+
+def _check_color_header(header: ImageHeader, where: str) -> None:
+    if header.bits != 8:
+        raise FrameError(
+            f"{where}: colour must be 8 bits a channel, got uint16; is this a depth image?"
+        )
+
+
+def _check_depth_header(header: ImageHeader, where: str) -> None:
+    if (header.channels, header.bits) != (1, 16):
+        raise FrameError(
+            f"{where}: depth must be one channel of 16 bits, got {header.channels} of uint{header.bits}; "
+            "an 8-bit or coloured picture of depth holds no distances"
+        )
 
 
 def depth_to_metres(
@@ -212,9 +230,15 @@ def _read_bytes(path: Path, count: int = -1) -> bytes:
         ) from error
 
 
-def decode_image(data: bytes, where: str) -> NDArray:
-    """The bytes of a PNG, JPEG or PGM file as OpenCV decodes them, unchanged; FrameError otherwise."""
+def decode_image(
+    data: bytes, where: str, check: Callable[[ImageHeader, str], None] | None = None
+) -> NDArray:
+    """The bytes of a PNG, JPEG or PGM file as OpenCV decodes them, unchanged; FrameError otherwise.
+    `check` may refuse it by its header before memory is taken.
+    """
     header = read_header(data, where)
+    if check is not None:
+        check(header, where)
     check_whole(data, header, where)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)

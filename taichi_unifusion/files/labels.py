@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from .mesh_reading import read_mesh
 from .text_rows import parse_lines
 
 SUFFIXES = (".ply", ".txt", ".npy")
+LABEL = re.compile(r"-?[0-9]{1,9}")
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ def read_class_names(path: str | Path) -> dict[int, str]:
     names: dict[int, str] = {}
     for number, line in _lines(Path(path)):
         label, _, name = line.partition(" ")
-        if not label.lstrip("-").isdecimal() or not name.strip():
+        if not LABEL.fullmatch(label) or not name.strip():
             raise FileError(
                 f"{path}, line {number}: expected 'label name', such as '3 chair', got '{line[:80]}'"
             )

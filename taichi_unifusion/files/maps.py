@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, MapCorrupt, UniFusionError
-from .atomic import atomic_write, file_error
+from .atomic import atomic_write, check_name, file_error
 
 FORMAT = "taichi_unifusion LIM"
 FORMAT_VERSION = 1
@@ -161,6 +161,7 @@ def _bytes_of(array: NDArray[Any]) -> memoryview:
 @contextmanager
 def _open(path: str | os.PathLike[str]) -> Iterator[BufferedReader]:
     """The open file; what the system says while it is read becomes a FileError."""
+    check_name(path)
     if Path(path).exists() and not Path(path).is_file():
         raise FileError(f"{path}: is not a regular file, so not a map file")
     try:

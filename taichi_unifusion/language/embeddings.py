@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, InputError, did_you_mean
 from ..files.arrays import read_archive, read_array
 from ..files.atomic import read_bytes
+from ..files.json_text import parse_json
 from ..networks.encoders import unit_length
 
 
@@ -67,16 +67,12 @@ def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> Tex
     """
     path = Path(file)
     if path.suffix == ".npz":
-        arrays = read_archive(path)
-        if not {"names", "vectors"} <= set(arrays.files):
-            raise InputError(f"{path}: must hold arrays 'names' and 'vectors'")
-        try:
-            listed, vectors = [str(name) for name in arrays["names"]], arrays["vectors"]
-        except ValueError:
+        named, vectors = read_archive(path, ("names", "vectors")).values()
+        if named.ndim != 1 or named.dtype.kind != "U":
             raise InputError(
-                f"{path}: its names are Python objects, which can run code; save them as an array of "
-                "text"
-            ) from None
+                f"{path}: 'names' must be a list of texts, got {named.shape} {named.dtype}"
+            )
+        listed = [str(name) for name in named]
     else:
         vectors = read_array(path)
         beside = [path.with_suffix(suffix) for suffix in (".txt", ".json", ".csv")]
@@ -106,14 +102,14 @@ def _read_names(path: Path) -> list[str]:
         if path.suffix == ".json":
             return [
                 entry["name"] if isinstance(entry, dict) else str(entry)
-                for entry in json.loads(text)
+                for entry in parse_json(text)
             ]
         if path.suffix == ".csv":
             return [row[-1] for row in csv.reader(text.splitlines()) if row]
         return [
             line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")
         ]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, csv.Error) as error:
         raise FileError(
             f"{path}: not a list of names ({type(error).__name__}: {str(error)[:120]})"
         ) from None

@@ -7,7 +7,6 @@ several scales: slower, coarser, with more context.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, FrameError, InputError, MissingDependency, check_choice
 from ..files.atomic import read_bytes
+from ..files.json_text import parse_json
 from ..types import Frame
 from .encoders import unit_length
 from .image_input import normalized, resized, whole_patches
@@ -258,7 +258,7 @@ def _normalization(name: str, kind: str) -> tuple[Sequence[float], Sequence[floa
     file = Path(name) / "preprocessor_config.json"
     if file.is_file():
         try:
-            values = json.loads(read_bytes(file))
+            values = parse_json(read_bytes(file))
             if "image_mean" in values and "image_std" in values:
                 return values["image_mean"], values["image_std"]
         except ValueError as error:

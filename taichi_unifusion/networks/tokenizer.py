@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import io
 import re
+import zlib
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +17,7 @@ from ..errors import FileError, InputError
 from ..files.atomic import read_bytes
 
 MERGES = 49152 - 256 - 2  # that CLIP uses; the published list is longer
+MAX_BYTES = 16 << 20  # of the list; the published one has 3 MB, of which the beginning is used
 WORD_END = "</w>"
 PIECES = re.compile(
     r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[^\W\d_]+|\d|(?:[^\s\w]|_)+",
@@ -90,9 +93,14 @@ class ClipTokenizer:
 def _read_merges(path: Path) -> list[tuple[str, str]]:
     data = read_bytes(path)
     try:
-        text = (gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data).decode("utf-8")
-    except (OSError, EOFError, UnicodeDecodeError):
+        if data[:2] == b"\x1f\x8b":
+            with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+                data = file.read(MAX_BYTES + 1)
+        text = data.decode("utf-8")
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError):
         raise FileError(f"{path}: not a list of byte-pair merges, or a damaged file") from None
+    if len(data) > MAX_BYTES:
+        raise FileError(f"{path}: unpacks to more than any list of merges holds")
     # the first line is a version
     lines = [line.split() for line in text.splitlines()[1 : MERGES + 1]]
     pairs = [(line[0], line[1]) for line in lines if len(line) == 2]

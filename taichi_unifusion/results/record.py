@@ -11,6 +11,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from ..errors import FileError, InputError, convert, shortened
 from ..files.atomic import read_bytes, write_text
+from ..files.json_text import parse_json
 
 UNFINISHED = "unfinished"  # stands in a file that is there while a run writes
 SCHEMA_VERSION = 1  # files without a number are older, and are read as version 1
@@ -201,8 +202,8 @@ def write_record(path: Path, record: RunRecord) -> None:
 def read_record(path: Path) -> RunRecord:
     """Read a record; raises FileError where it is missing, damaged or of a newer version."""
     try:
-        values = json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
+        values = parse_json(read_bytes(path))
+    except ValueError as error:
         raise FileError(f"{path}: not the metrics of a run, or a damaged file ({error})") from None
     if isinstance(values, dict) and values.get(UNFINISHED):
         raise FileError(

@@ -4,7 +4,6 @@ cameras.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, UniFusionError
 from ..files.atomic import read_bytes
+from ..files.json_text import parse_json
 from ..files.mesh_reading import read_any_mesh, read_mesh
 from ..files.ply import color_to_uint8
 from ..files.trajectories import read_trajectory
@@ -196,7 +196,7 @@ def _read_json(file: Path):
     if not file.exists():
         return None
     try:
-        return json.loads(read_bytes(file))
+        return parse_json(read_bytes(file))
     except (FileError, ValueError) as error:
         logger.warning("%s: cannot be read (%s)", file, error)
         return None

@@ -20,11 +20,15 @@ from dataset_writers import (
     write_replica,
     write_seven_scenes,
 )
+from memory import peak_memory
 
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.plausibility import guess_depth_scale
-from taichi_unifusion.errors import FrameError, InputError, SizeMismatch
-from taichi_unifusion.files.images import depth_file_size, read_color, read_depth
+from taichi_unifusion.errors import FileError, FrameError, InputError, SizeMismatch
+from taichi_unifusion.files.arrays import read_array
+from taichi_unifusion.files.atomic import check_writable, read_bytes, write_text
+from taichi_unifusion.files.images import depth_file_size, read_color, read_depth, read_values
+from taichi_unifusion.files.maps import read_map
 
 # [bytes] allocated while refusing a hostile header; its image would take gigabytes
 REFUSED_COST = 2 << 20
@@ -304,3 +308,50 @@ def test_npy_depth_of_every_usual_type(tmp_path):
     np.save(tmp_path / "depth.npy", np.array([[1500, 7]], np.int64))
     with pytest.raises(FrameError, match="16 bits"):
         read_depth(tmp_path / "depth.npy", 1000.0)
+
+
+def _png_saying(width: int, height: int, bits: int, kind: int) -> bytes:
+    """A whole PNG file whose header says so and whose data are a few zeros."""
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content))
+            + name
+            + content
+            + struct.pack(">I", zlib.crc32(name + content))
+        )
+
+    header = struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
+    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"\0" * 99)), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def test_c14_decoders_are_not_asked_for_more_than_a_camera_has(tmp_path):
+    """F11 too: bits, channels, bytes and the camera's size are judged by the header alone."""
+    path = tmp_path / "a.png"
+    with peak_memory() as peak:
+        path.write_bytes(_png_saying(10_000, 10_000, 16, 6))
+        for read in (read_color, read_values, lambda file: read_depth(file, 1000)):
+            with pytest.raises(FrameError, match="4 times 16 bits, 800 MB, refused"):
+                read(path)
+        path.write_bytes(_png_saying(9000, 9000, 16, 0))
+        with pytest.raises(FrameError, match="colour must be 8 bits a channel, got uint16"):
+            read_color(path)
+        with pytest.raises(SizeMismatch, match="depth is 9000x9000 but the camera is 640x480"):
+            read_depth(path, 1000, size=(640, 480))
+        path.write_bytes(_png_saying(9000, 9000, 8, 2))
+        with pytest.raises(FrameError, match="one channel of 16 bits, got 3 of uint8"):
+            read_depth(path, 1000)
+    assert peak.megabytes < 50
+
+
+def test_c15_a_zero_byte_in_a_name_is_a_sentence(tmp_path):
+    for use in (
+        lambda name: check_writable(name),
+        lambda name: read_bytes(name),
+        lambda name: write_text(name, "a"),
+        lambda name: read_map(name),
+        lambda name: read_array(name),
+    ):
+        with pytest.raises(FileError, match="zero byte"):
+            use(str(tmp_path / "a\0b"))

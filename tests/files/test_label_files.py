@@ -21,7 +21,7 @@ def test_M6_an_array_with_a_payload_is_refused_and_not_run(tmp_path):
     (tmp_path / "labels.npy").write_bytes(pickle.dumps(Payload()))
     np.save(tmp_path / "objects.npy", np.array([Payload()], dtype=object), allow_pickle=True)
     for name in ("labels.npy", "objects.npy"):
-        with pytest.raises(FileError, match="not an array that NumPy wrote"):
+        with pytest.raises(FileError, match="not an array that NumPy wrote|can run code"):
             read_labels(tmp_path / name)
     assert not (tmp_path / "ran").exists()
 
