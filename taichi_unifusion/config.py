@@ -25,6 +25,7 @@ from .maps.settings import (
     PropertySettings,
     SurfaceSettings,
     check_voxel_size,
+    parse_bytes,
 )
 from .preprocessing import PreprocessSettings
 from .tracking.base import TrackingSettings
@@ -78,6 +79,10 @@ class Config:
     """Consecutive frames that are summed up before they are fused; 1 fuses each by itself, as
     published, and is slower.
     """
+    map_memory: str = ""
+    """Memory for the maps, as 2GB or 500MB: parts of them that were not seen for longest lie on disk.
+    Empty: all of them are in memory.
+    """
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     """The map of the surface."""
     color: PropertySettings = field(default_factory=PropertySettings)
@@ -120,6 +125,8 @@ class Config:
             raise InputError(f"threads: must not be negative, got {self.threads}")
         if not 1 <= self.window <= MAX_WINDOW:
             raise InputError(f"window: must lie in 1..{MAX_WINDOW} frames, got {self.window}")
+        if self.map_memory:
+            parse_bytes(self.map_memory, "map_memory")
 
 
 def _sized(settings: S, scale: float) -> S:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Protocol, cast
 
 import numpy as np
@@ -26,7 +27,9 @@ from .maps.detail import Sight, sight_of
 from .maps.kept_window import KeptWindow
 from .maps.property_group import group_maps
 from .maps.settings import PropertySettings
+from .maps.tiled_mesh import joined_mesh
 from .maps.window import WindowFusion
+from .maps.working_set import make_memory
 from .networks.encoders import ImageEncoder
 from .preprocessing import PreprocessSettings, find_patches, invert_depth, preprocess
 from .properties import SurfaceProperty, make_property
@@ -70,7 +73,9 @@ class Pipeline:
         pipeline.extract_mesh().save("kitchen.ply")
 
     With `synchronize` off, the times of stages are those of launching them: CUDA may then overlap
-    them. `keep` is told of every window that was fused; `pipeline.fusion.take_out` undoes one.
+    them. `keep` is told of every window that was fused; `pipeline.fusion.take_out` undoes one. With
+    `map_memory` in the configuration, maps are kept within it; what does not fit lies in the folder
+    `tiles`, a folder a map, and `extract_mesh` goes through all of it.
     """
 
     def __init__(
@@ -81,6 +86,7 @@ class Pipeline:
         *,
         synchronize: bool = True,
         keep: Callable[[KeptWindow], None] | None = None,
+        tiles: str | Path | None = None,
     ) -> None:
         self.config = config = config or Config()
         self.synchronize = synchronize
@@ -88,7 +94,9 @@ class Pipeline:
         features = [FeatureSource(encoder, config.feature_map)] if encoder is not None else []
         self.sources = _by_name((*made, *properties, *features))
         runtime.init(config.device, threads=config.threads or None)
-        self.fusion = WindowFusion(config.window, keep)
+        self.memory = make_memory(config.map_memory, tiles)
+        settle = self.memory.settle if self.memory else lambda: None
+        self.fusion = WindowFusion(config.window, keep, settle)
         self._maps: dict[str, BaseMap] = {}
         given = config.surface.voxel_size and config.color.voxel_size and not self.sources
         if config.voxel_size or given:  # nothing is left to choose
@@ -126,6 +134,8 @@ class Pipeline:
                 maps.append(sized.make_map())
         self._maps = {each.name: each for each in maps}
         self.groups = group_maps(maps)
+        if self.memory:
+            self.memory.follow(self._maps)
         finest = min(each.voxel_size for each in maps)
         patch_size = min(config.preprocess.patch_size, finest / 2)
         self._preprocess = replace(config.preprocess, patch_size=patch_size)
@@ -166,6 +176,8 @@ class Pipeline:
         frame, lacking = self._with_properties(frame, clock)
         with clock.stage("preprocess"):
             images, view = self.fusion.place(frame)
+            if self.memory:
+                self.memory.see(frame)
             inverse = invert_depth(frame, self._preprocess, images, view)
         with clock.stage("sum"):
             find = partial(find_patches, frame, self._preprocess, inverse, T_world_camera)
@@ -199,6 +211,8 @@ class Pipeline:
         alone = [group for group in self.groups if not group.sums_up]
         if not alone:
             return done
+        if self.memory and self.fusion.window is None:
+            self.memory.settle()
         with clock.stage("points"):
             settings = replace(self._preprocess, patch_size=0.0)
             cloud = preprocess(frame, settings).transformed(frame.require_pose())
@@ -234,6 +248,8 @@ class Pipeline:
                 if name not in self._maps:
                     self._maps[name] = source.make_map(frame)
                     self.groups = group_maps(self._maps.values())
+                    if self.memory:
+                        self.memory.follow(self._maps)
             except FrameError as error:
                 lacking[name] = str(error)
                 frame = frame.without_image(name)
@@ -306,10 +322,13 @@ class Pipeline:
         be fused are left out: see `SurfaceMap.extract_mesh`.
         """
         settings = self.config.mesh
+        resolution = settings.resolution if resolution is None else resolution
+        if self.memory and blocks is None:
+            return joined_mesh(self.memory, resolution, settings.min_area)
         return extract_mesh(
             self.surface,
             self.properties,
-            settings.resolution if resolution is None else resolution,
+            resolution,
             settings.min_area if blocks is None else 0.0,
             blocks=blocks,
             flush=flush,

@@ -220,7 +220,7 @@ def _usable(
 
 def _color_map(options: EvaluateRendering, run: Run | None):
     """The colour map of the run, or None where vertex colours are to be judged."""
-    path = run.folder.map("color") if run else None
+    path = run.folder.saved_map("color") if run else None
     if path is None or options.vertex_colors:
         return None
     if not path.exists():

@@ -6,7 +6,7 @@ Nothing here imports `types`, so that `Mesh.save` can call it.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from ..errors import InputError
 
 # type in the file, names of the properties, values (V, number of names)
 Column = tuple[str, tuple[str, ...], NDArray[Any]]
+FACE_ROW = np.dtype([("count", "u1"), ("indices", "<i4", 3)])
 
 
 class Triangles(Protocol):
@@ -55,6 +56,17 @@ def write_ply(file: BinaryIO, mesh: Triangles) -> None:
     a comment in the header says which, so that reading gives the same attributes. Raises InputError
     for names that PLY cannot hold.
     """
+    rows, comments = vertex_rows(mesh)
+    file.write(ply_header(rows.dtype, comments, len(rows), len(mesh.faces)))
+    for table in (rows, face_rows(mesh.faces)):
+        if len(table):
+            file.write(table.view(np.uint8).data)
+
+
+def vertex_rows(mesh: Triangles) -> tuple[NDArray[Any], list[str]]:
+    """A row (V,) of properties for every vertex, and the header's comments; raises InputError as
+    `write_ply`.
+    """
     columns, comments = _columns_of(mesh)
     rows = np.empty(
         len(mesh.vertices), [(name, kind) for kind, group, _ in columns for name in group]
@@ -62,24 +74,30 @@ def write_ply(file: BinaryIO, mesh: Triangles) -> None:
     for _, group, values in columns:
         for i, name in enumerate(group):
             rows[name] = values[:, i]
-    triangles = np.empty(len(mesh.faces), [("count", "u1"), ("indices", "<i4", 3)])
-    triangles["count"], triangles["indices"] = 3, mesh.faces
+    return rows, comments
 
-    kinds = {"<f4": "float", "u1": "uchar"}
-    header = [
+
+def face_rows(faces: NDArray[np.int32]) -> NDArray[Any]:
+    """A row (F,) for every triangle (F, 3)."""
+    rows = np.empty(len(faces), FACE_ROW)
+    rows["count"], rows["indices"] = 3, faces
+    return rows
+
+
+def ply_header(rows: np.dtype, comments: Sequence[str], vertices: int, triangles: int) -> bytes:
+    """The header of a file with so many rows of vertices, and triangles."""
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    lines = [
         "ply",
         "format binary_little_endian 1.0",
         *comments,
-        f"element vertex {len(rows)}",
-        *(f"property {kinds[kind]} {name}" for kind, group, _ in columns for name in group),
-        f"element face {len(triangles)}",
+        f"element vertex {vertices}",
+        *(f"property {kinds[rows[name].str]} {name}" for name in rows.names or ()),
+        f"element face {triangles}",
         "property list uchar int vertex_indices",
         "end_header",
     ]
-    file.write(("\n".join(header) + "\n").encode("ascii"))
-    for table in (rows, triangles):
-        if len(table):
-            file.write(table.view(np.uint8).data)
+    return ("\n".join(lines) + "\n").encode("ascii")
 
 
 def _columns_of(mesh: Triangles) -> tuple[list[Column], list[str]]:

@@ -170,6 +170,18 @@ def claim_slots(
 
 
 @ti.kernel
+def assign_slots(
+    # in:
+    keys: Ints2,  # (N, 3) voxels that have no slot
+    first: ti.i32,
+    # in and out:
+    index: ti.template(),  # the voxels have slots `first`, `first` + 1, ...
+):
+    for n in range(keys.shape[0]):
+        index.slot[row3(keys, n) + INDEX_HALF] = first + n + 1
+
+
+@ti.kernel
 def find_slots(
     # in:
     blocks: ti.i32,

@@ -41,3 +41,15 @@ def gather_rows(
 ):
     for n in range(places.shape[0]):
         copy_row(rows, places[n], gathered, n)
+
+
+@ti.kernel
+def scatter_rows(
+    # in:
+    places: Ints1,  # (N,) rows to fill, each once
+    rows: ti.types.ndarray(),  # (N, ...)
+    # out:
+    target: ti.types.ndarray(),  # (S, ...)
+):
+    for n in range(places.shape[0]):
+        copy_row(rows, n, target, places[n])

@@ -41,7 +41,9 @@ MAP_KINDS = {  # kind, as in files -> module here, class
 
 
 def load_map(path: str | Path) -> BaseMap:
-    """The map in a file, of whatever kind it is; raises MapCorrupt or FileError."""
+    """The map in a file, or in the folder of its tiles, of whatever kind it is; raises MapCorrupt,
+    FileError or CapacityError.
+    """
     from .stored import read_stored
 
     description, data = read_stored(Path(path))

@@ -101,31 +101,36 @@ class BaseMap(ABC, Generic[S]):
                 "merge: the maps differ: {} '{}' x{} {} and {} '{}' x{} {}".format(*mine, *theirs)
             )
         self.flush()
-        self._fuse_voxels(other.voxels())
+        self.fuse_voxels(other.voxels())
 
     def _identity(self) -> tuple[str, str, int, S]:
         return self.kind, self.name, self.channels, self.settings
 
     @abstractmethod
-    def _fuse_voxels(self, data: VoxelData) -> None:
+    def fuse_voxels(self, data: VoxelData) -> None:
         """Fuse the voxels of another map into this one."""
 
     def save(self, path: str | Path) -> None:
         """Write the map to one file; readable on any device. Raises FileError where that fails; an
         old file then stays.
         """
-        manifest = {
+        voxels = self.voxels()
+        write_map(Path(path), voxels.tensors, {**self.manifest(), "voxels": len(voxels)})
+
+    def manifest(self) -> dict[str, Any]:
+        """What kind of map this is, in JSON values."""
+        return {
             "kind": self.kind,
             "name": self.name,
             "channels": self.channels,
-            "voxels": len(self),
             "settings": dataclasses.asdict(self.settings),
         }
-        write_map(Path(path), self.voxels().tensors, manifest)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a map of this kind written by `save`; raises MapCorrupt or FileError."""
+        """Read a map of this kind written by `save`, or one in tiles, all of which then have to fit in
+        memory; raises MapCorrupt, FileError or CapacityError.
+        """
         description, data = read_stored(Path(path))
         if description.kind != cls.kind:
             raise MapCorrupt(f"{path}: holds a map of kind '{description.kind}', not '{cls.kind}'")
@@ -135,7 +140,7 @@ class BaseMap(ABC, Generic[S]):
     def restored(cls, description: MapDescription, data: VoxelData) -> Self:
         """The map that a file of this kind holds."""
         made = cls._empty(description.name, description.channels, description.settings)
-        made.grid.put(data)
+        made.grid.add(data)
         return made
 
     @classmethod

@@ -25,6 +25,7 @@ class MeshedSurface:
 
     weights: NDArray[np.float32]  # (S,); 0 where there was no voxel
     visible: NDArray[np.uint8]  # (S, 16) support and evidence of a voxel's cells, as bits
+    packed: int = 0  # how often the grid had given its voxels other slots
 
     @classmethod
     def nothing(cls) -> MeshedSurface:
@@ -42,6 +43,8 @@ def changed_blocks(
     visible or ceased to be. Frames that wait to be fused do not count.
     """
     grid = surface.grid
+    if before.packed != grid.packed:  # slots are others now
+        before = MeshedSurface.nothing()
     weights = _of_slots(grid, WEIGHTS)
     bits = [_of_slots(grid, MASKS).view(np.uint8)]
     if "evidence" in grid:
@@ -54,9 +57,9 @@ def changed_blocks(
     changed = np.flatnonzero(grown | (visible != known).any(axis=1))
     meshed[changed] = weights[changed]
     if not len(changed):
-        return np.zeros((0, 3), np.int32), MeshedSurface(meshed, visible)
+        return np.zeros((0, 3), np.int32), MeshedSurface(meshed, visible, grid.packed)
     keys = _of_slots(grid, KEYS)[changed]
-    return mesh_blocks(keys), MeshedSurface(meshed, visible)
+    return mesh_blocks(keys), MeshedSurface(meshed, visible, grid.packed)
 
 
 def _of_slots(grid: VoxelGrid, field: VoxelField) -> NDArray:

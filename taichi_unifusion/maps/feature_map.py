@@ -350,7 +350,7 @@ class FeatureMap(BaseMap[FeatureSettings]):
             )
         return values, valid.astype(bool)
 
-    def _fuse_voxels(self, data: VoxelData) -> None:
+    def fuse_voxels(self, data: VoxelData) -> None:
         """Exact, up to the rounding of what is kept."""
         n = len(data)
         if n:

@@ -8,6 +8,7 @@ latents.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING
@@ -196,11 +197,19 @@ def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
 
 def connected_parts(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
     """For each of so many vertices, the first vertex (V,) of the part that its faces connect it to."""
+    return parts_by_pieces(lambda: [faces], vertices)
+
+
+def parts_by_pieces(
+    faces: Callable[[], Iterable[NDArray[np.int32]]], vertices: int
+) -> NDArray[np.int32]:
+    """As `connected_parts`; `faces` gives them (F, 3), some at a time, each time that it is called."""
     part, changed = np.arange(vertices, dtype=np.int32), np.ones(1, np.int32)
     while changed[0]:
         changed[0] = 0
-        kernels.join_parts(faces, part, changed)
-        runtime.synchronize()
+        for some in faces():
+            kernels.join_parts(some, part, changed)
+            runtime.synchronize()
     return part
 
 

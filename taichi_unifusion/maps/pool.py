@@ -9,11 +9,12 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from ..errors import CapacityError
-from ..kernels.pools import copy_rows, gather_rows
+from ..kernels.pools import copy_rows, gather_rows, scatter_rows
 from ..runtime import DeviceArray
 from .voxel_data import VoxelField
 
 MAX_ELEMENTS = 2**31 - 1  # of an array of Taichi
+MOVED = 65_536  # rows moved at once
 _TAICHI = {
     np.dtype(np.float32): ti.f32,
     np.dtype(np.float16): ti.f16,
@@ -61,3 +62,20 @@ class Pool:
         if rows.size:
             gather_rows(slots, self.array, rows)
         return rows
+
+    def put(self, slots: NDArray[np.int32], rows: NDArray) -> None:
+        """Fill the rows in `slots`, each once."""
+        if rows.size:
+            scatter_rows(slots, np.ascontiguousarray(rows), self.array)
+
+    def move_down(self, slots: NDArray[np.int32], used: int) -> None:
+        """Make the rows in `slots`, in ascending order, the first ones of the `used`; the others
+        become 0, as rows are that no voxel has had yet.
+        """
+        for begin in range(0, len(slots), MOVED):
+            part = np.ascontiguousarray(slots[begin : begin + MOVED])
+            # rows that are still to be moved lie above those that are filled here
+            self.put(np.arange(begin, begin + len(part), dtype=np.int32), self.take(part))
+        for begin in range(len(slots), used, MOVED):
+            places = np.arange(begin, min(begin + MOVED, used), dtype=np.int32)
+            self.put(places, np.zeros((len(places), *self.field.shape), self.field.dtype))

@@ -172,7 +172,7 @@ class RegressionMap(BaseMap[S]):
             return cloud
         return cloud.take(np.flatnonzero(np.isfinite(observed).all(axis=1)))
 
-    def _fuse_voxels(self, data: VoxelData) -> None:
+    def fuse_voxels(self, data: VoxelData) -> None:
         if len(data) == 0:
             return
         sums = data.sums

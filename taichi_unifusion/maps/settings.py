@@ -4,6 +4,7 @@ map.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
@@ -200,3 +201,17 @@ def check_name(what: str, name: object) -> None:
         raise InputError(
             f"{what}: must be 1 to {MAX_NAME} printable letters, got {shortened(name)}"
         )
+
+
+def parse_bytes(text: str, what: str) -> int:
+    """A size as people write it, in powers of 1000: 2GB, 500 MB; raises InputError, which says
+    `what` it is of.
+    """
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMGT]?)i?B?\s*", text, re.IGNORECASE)
+    power = "kmgt".find((found.group(2) or " ").lower()) + 1 if found else 0
+    count = float(found.group(1)) * 1000**power if found else 0.0
+    if not 1e6 <= count <= 1e15:
+        raise InputError(
+            f"{what}: expected a size as 2GB or 500MB, at least 1 MB, got {shortened(text)}"
+        )
+    return int(count)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, MapCorrupt, check_choice, convert, did_you_mean, shortened
-from ..files.maps import CONTAINER_KEYS, read_manifest, read_map
+from ..files.maps import CONTAINER_KEYS, FORMAT_VERSION, read_manifest, read_map
+from ..files.tiles import Tile, TileFolder
 from ..kernels.fusion import LEAST_WEIGHT
 from ..kernels.index import INDEX_HALF
 from .encoding import position_encoding
@@ -85,18 +86,42 @@ class MapDescription:
 
 
 def read_description(path: str | os.PathLike[str]) -> MapDescription:
-    """What a map file says about itself, checked with the sizes of its tensors; no tensor is read.
+    """What a map file says about itself, checked with the sizes of its tensors, or what the index of
+    a map in tiles says; no tensor is read.
 
     Raises FileError where it cannot be read, MapCorrupt where it makes no sense.
     """
+    if TileFolder.is_one(path):
+        return describe_tiles(TileFolder.open(path))
     return describe(path, read_manifest(path))
 
 
+def describe_tiles(folder: TileFolder) -> MapDescription:
+    """The description in the index of a map in tiles; raises MapCorrupt."""
+    manifest = {**folder.manifest, "voxels": folder.voxels, "format_version": FORMAT_VERSION}
+    return _described(folder.index, manifest)
+
+
 def read_stored(path: str | os.PathLike[str]) -> tuple[MapDescription, VoxelData]:
-    """Description and voxels of a map file; errors as `read_description`.
+    """Description and voxels of a map file, or of all tiles of a map; errors as `read_description`.
 
     Sizes are compared with the settings before a tensor is read, numbers before they are used.
     """
+    if TileFolder.is_one(path):
+        folder = TileFolder.open(path)
+        description = describe_tiles(folder)
+        tiles = [read_tile(folder, tile) for tile in sorted(folder.tiles)]
+        fields = {
+            field.name: np.concatenate(
+                [
+                    np.empty((0, *field.shape), field.dtype),
+                    *(data.tensors[field.name] for data in tiles),
+                ]
+            )
+            for field in (KEYS, *description.fields)
+        }
+        _check_voxels(path, description, fields)  # two tiles may not hold the same voxel
+        return description, VoxelData(fields.pop(KEYS.name), fields)
     tensors, manifest = read_map(path, check=partial(describe, path))
     description = describe(path, manifest)
     _check_voxels(path, description, tensors)
@@ -105,8 +130,25 @@ def read_stored(path: str | os.PathLike[str]) -> tuple[MapDescription, VoxelData
     )
 
 
+def read_tile(folder: TileFolder, tile: Tile) -> VoxelData:
+    """The voxels of a tile, checked as `read_stored` does; raises FileError or MapCorrupt."""
+    description = describe_tiles(folder)
+    tensors, file = folder.read(tile, describe)
+    _check_voxels(file, description, tensors)
+    return VoxelData(
+        tensors["keys"], {field.name: tensors[field.name] for field in description.fields}
+    )
+
+
 def describe(path: object, manifest: Mapping[str, Any]) -> MapDescription:
     """The description in a manifest, whose tensors are those of such a map; raises MapCorrupt."""
+    description = _described(path, manifest)
+    _check_sizes(path, description, manifest["tensors"])
+    return description
+
+
+def _described(path: object, manifest: Mapping[str, Any]) -> MapDescription:
+    """The description in a manifest, whatever its tensors are; raises MapCorrupt."""
     try:
         _check_keys(manifest, (*MANIFEST_KEYS, *CONTAINER_KEYS), "")
         kind = exact(manifest.get("kind"), Literal[tuple(KINDS)], "kind")
@@ -132,7 +174,6 @@ def describe(path: object, manifest: Mapping[str, Any]) -> MapDescription:
             f"{path}: {error}; no version of taichi_unifusion up to this one writes such a map: "
             "integrate the frames again"
         ) from None
-    _check_sizes(path, description, manifest["tensors"])
     return description
 
 

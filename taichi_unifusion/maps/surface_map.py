@@ -145,8 +145,8 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         t = encoding.nodes(CELLS) / 2  # a voxel is the inner half of its doubled voxel
         return to_device(np.concatenate([encoding(t)[:, None], 0.5 * encoding.gradient(t)], axis=1))
 
-    def _fuse_voxels(self, data: VoxelData) -> None:
-        super()._fuse_voxels(data)
+    def fuse_voxels(self, data: VoxelData) -> None:
+        super().fuse_voxels(data)
         if data.evidence is not None and len(data):
             self.add_evidence(self.grid.slots_of(data.keys), data.evidence)
 

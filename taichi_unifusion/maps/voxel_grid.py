@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from .. import runtime
 from ..errors import CapacityError
 from ..kernels import index as kernels
-from ..kernels.pools import gather_rows
 from ..runtime import DeviceArray, grown
 from .pool import Pool
 from .voxel_data import KEYS, VoxelData, VoxelField
@@ -48,6 +47,7 @@ class VoxelGrid:
         self.fields = tuple(fields)
         self.count = 0  # slots given out
         self.empty = 0  # of them, those whose voxel was removed
+        self.packed = 0  # how often `retain` gave voxels other slots
         self.frame = 0
         self.unclosed: Any = None  # `CellArrays` with the keys of the voxels that are touched now
         self.index = self._borrow_tree()
@@ -84,11 +84,7 @@ class VoxelGrid:
         if free:
             _, tree = free.pop(self._most_alike(free))
             self.runtime.earlier[tree] = _count_free(self.runtime, tree)
-            if self.runtime.device == "cpu":
-                tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
-            else:  # there nodes that were given back are not safe to fill again (taichi#6401)
-                tree.slot.fill(0)
-                tree.stamp.fill(0)
+            _clear_tree(tree, self.runtime.device)
         else:
             self.runtime.count_tree()
             if _too_large(self.runtime):
@@ -219,7 +215,7 @@ class VoxelGrid:
         runtime.synchronize()
         self.empty += int(released[0])
 
-    def _used(self) -> NDArray[np.int32]:
+    def used_slots(self) -> NDArray[np.int32]:
         """Slots that hold a voxel."""
         if not self.empty:
             return np.arange(self.count, dtype=np.int32)
@@ -227,33 +223,56 @@ class VoxelGrid:
 
     def voxel_keys(self) -> NDArray[np.int32]:
         """(N, 3) voxel indices, in no order."""
-        return self["keys"].to_numpy()[self._used()]
+        return self._pools[KEYS.name].take(self.used_slots())
 
     def export(self) -> VoxelData:
         """All voxels by value."""
         runtime.check_alive(self.runtime)
-        keys, used = self.voxel_keys(), self._used()
-        order = np.lexsort(keys.T[::-1])
-        slots = np.ascontiguousarray(used[order])
-        fields = {field.name: self._pools[field.name].take(slots) for field in self.fields}
-        return VoxelData(np.ascontiguousarray(keys[order]), fields)
+        return self.take(self.used_slots()[np.lexsort(self.voxel_keys().T[::-1])])
 
-    def put(self, data: VoxelData) -> None:
-        """Fill this empty grid with voxels, exactly as they are."""
-        assert self.count == 0
-        if len(data):
-            slots = np.empty(len(data), np.int32)
-            self.claim(len(data), data.keys, data.weights, slots)
-            order = np.argsort(slots, kind="stable").astype(np.int32)
-            for field in self.fields:
-                gather_rows(order, data.fields[field.name], self[field.name])
+    def add(self, data: VoxelData) -> None:
+        """Add voxels, none of which is there, exactly as they are; raises CapacityError."""
+        n = len(data)
+        if n:
+            self.reserve(n)
+            kernels.assign_slots(data.keys, self.count, self.index)
+            places = np.arange(self.count, self.count + n, dtype=np.int32)
+            for name, pool in self._pools.items():
+                pool.put(places, data.keys if name == KEYS.name else data.fields[name])
+            self.count += n
+
+    def take(self, slots: NDArray[np.int32]) -> VoxelData:
+        """The voxels in `slots` by value, in that order."""
+        slots = np.ascontiguousarray(slots)
+        fields = {field.name: self._pools[field.name].take(slots) for field in self.fields}
+        return VoxelData(self._pools[KEYS.name].take(slots), fields)
+
+    def retain(self, slots: NDArray[np.int32]) -> None:
+        """Keep the voxels in `slots`, in ascending order, and no other; what these took of the pools
+        and of the index serves the next ones. No frame may be summed up meanwhile.
+        """
+        runtime.check_alive(self.runtime)
+        self.recount()
+        self._inherited = max(self._inherited, self._leaves)
+        for pool in self._pools.values():
+            pool.move_down(slots, self.count)
+        _clear_tree(self.index, self.runtime.device)
+        self.count, self.empty, self.packed = len(slots), 0, self.packed + 1
+        if len(slots):
+            kept = self._pools[KEYS.name].take(np.arange(len(slots), dtype=np.int32))
+            kernels.assign_slots(kept, 0, self.index)
+        self.recount()
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a voxel in the pools."""
+        return sum(field.bytes for field in (KEYS, *self.fields))
 
     @property
     def memory_bytes(self) -> int:
         """Bytes that the voxels need: pools as far as they are used, and the index tree."""
         leaves = int(kernels.count_leaves(self.index)) if self.count else 0
-        row = sum(field.bytes for field in (KEYS, *self.fields))
-        return self.count * row + leaves * BYTES_PER_LEAF
+        return self.count * self.row_bytes + leaves * BYTES_PER_LEAF
 
 
 def _index_bytes(live: runtime.Runtime) -> int:
@@ -287,6 +306,15 @@ def _recount(live: runtime.Runtime) -> None:
 def _count_free(live: runtime.Runtime, tree: kernels.Index) -> int:
     """Leaves that a tree which no map uses ever had."""
     return max(live.earlier.get(tree, 0), int(kernels.count_leaves(tree)))
+
+
+def _clear_tree(tree: kernels.Index, device: str) -> None:
+    """Take all voxels out of an index tree, whose memory stays with it."""
+    if device == "cpu":
+        tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
+    else:  # there nodes that were given back are not safe to fill again (taichi#6401)
+        tree.slot.fill(0)
+        tree.stamp.fill(0)
 
 
 def _build_tree() -> kernels.Index:

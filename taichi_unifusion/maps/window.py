@@ -243,11 +243,14 @@ class WindowFusion:
     the next one fills, so that no frame of a video waits for a whole window.
 
     A size of 1 fuses every frame by itself, at once. `keep` is told of every window that was fused,
-    so that it can be taken out.
+    so that it can be taken out; `settle` is called whenever one was closed, before it is fused: then
+    nothing is summed up, and voxels may come and go.
     """
 
-    def __init__(self, size: int, keep: Keep | None = None) -> None:
-        self.size, self.keep = size, keep
+    def __init__(
+        self, size: int, keep: Keep | None = None, settle: Callable[[], None] = lambda: None
+    ) -> None:
+        self.size, self.keep, self.settle = size, keep, settle
         self.window: Window | None = None
         self.pieces: deque[Piece] = deque()
         self._begun: Piece | None = None  # that was handed out, and is not done
@@ -313,6 +316,7 @@ class WindowFusion:
             self.run(len(self.pieces))
             self.pieces.extend(self.window.close(self.keep))
             self.window = None
+            self.settle()
             self._images.reverse()
 
     def due(self, frames: int = 0) -> Iterator[Piece]:

@@ -50,7 +50,7 @@ class ExportSource:
         """The colours as a field, which says where its map knows them; raises FileError where there
         is no such map.
         """
-        file = self.folder.map(self.name)
+        file = self.folder.saved_map(self.name)
         if not self.has_map:
             raise FileError(
                 f"{file}: no such file, so there are no colours between the vertices: keep every "

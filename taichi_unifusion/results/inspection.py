@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from ..errors import FileError, UniFusionError
 from ..files.mesh_reading import read_any_mesh
+from ..files.tiles import TileFolder, map_bytes
 from ..maps.stored import read_stored
 from .lock import who_writes
 from .record import Source, read_record
@@ -34,7 +35,7 @@ def inspect(path: Path) -> Inspection:
     """Describe a results folder, a map file or a mesh; raises FileError where there is nothing to
     describe.
     """
-    if path.is_dir():
+    if path.is_dir() and not TileFolder.is_one(path):
         folder = RunFolder(path)
         maps, mesh, record = list(folder.maps.values()), folder.mesh, folder.record
         if not (maps or mesh.exists() or record.exists()):
@@ -77,11 +78,19 @@ def _describe_map(file: Path) -> list[str]:
         f"{stored.kind}, {stored.channels} channel{'s' if stored.channels > 1 else ''}",
         f"{stored.voxels:,}",
         f"{100 * settings.voxel_size:g} cm",
-        format_bytes(file.stat().st_size),
+        _size(file),
         f"Matern-7/2, rank {encoder.rank} of {encoder.anchors}, seed {encoder.seed}",
         settings.fusion,
         str(stored.version),
     ]
+
+
+def _size(file: Path) -> str:
+    """Bytes of a map on disk, and its tiles."""
+    size = format_bytes(map_bytes(file))
+    if not TileFolder.is_one(file):
+        return size
+    return f"{size} in {len(TileFolder.open(file).tiles)} tiles"
 
 
 def _describe_writer(folder: RunFolder) -> str | None:

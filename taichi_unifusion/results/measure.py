@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__, runtime
+from ..files.tiles import map_bytes
 from ..pipeline import Pipeline
 from ..rendering.look import Look, shown_range
 from ..run_log import RunResult, StepResult
@@ -60,7 +61,7 @@ def measure_run(
         ),
         maps={
             name: MapRecord(
-                target.voxel_size, len(target), target.memory_bytes, _size(folder.map(name))
+                target.voxel_size, _voxels(pipeline, name), target.memory_bytes, map_bytes(folder.saved_map(name))
             )
             for name, target in pipeline.maps.items()
         },
@@ -75,6 +76,13 @@ def measure_run(
         errors=tuple(str(error) for error in failed if error is not None),
         versions=versions(),
     )
+
+
+def _voxels(pipeline: Pipeline, name: str) -> int:
+    """Voxels of a map, those on disk included."""
+    if pipeline.memory:
+        return pipeline.memory.sets[name].folder.voxels
+    return len(pipeline.maps[name])
 
 
 def _count_frames(run: RunResult) -> FrameCounts:

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from ..files.tiles import INDEX
+
 MESH_SUFFIXES = ("ply", "glb", "obj")  # in the order in which meshes are written
 
 
@@ -54,15 +56,25 @@ class RunFolder:
         """The map of that name."""
         return self.map_folder / f"{name}.safetensors"
 
+    def tiled_map(self, name: str) -> Path:
+        """The folder with the tiles of the map of that name."""
+        return self.map_folder / name
+
+    def saved_map(self, name: str) -> Path:
+        """Where the map of that name lies, in tiles or in one file; need not exist."""
+        return self.maps.get(name, self.map(name))
+
     @property
     def maps(self) -> dict[str, Path]:
-        """The maps that exist, by name."""
-        return {path.stem: path for path in sorted(self.map_folder.glob(self.map("*").name))}
+        """The maps that exist, by name: files, or folders of tiles."""
+        files = {path.stem: path for path in sorted(self.map_folder.glob(self.map("*").name))}
+        tiled = {path.parent.name: path.parent for path in self.map_folder.glob(f"*/{INDEX}")}
+        return dict(sorted({**files, **tiled}.items()))
 
     @property
     def features(self) -> Path:
         """The map of image-text features, which questions are put to."""
-        return self.map("features")
+        return self.saved_map("features")
 
     @property
     def mesh(self) -> Path:

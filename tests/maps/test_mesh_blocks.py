@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from map_kinds import SMALL
+from mesh_laws import triangles
 from scenes import sphere
 from windows import CONFIG, stepped, walk
 
@@ -33,17 +34,8 @@ def random_surface(span: int = 20) -> SurfaceMap:
         "masks": rng.integers(0, 2**32, (len(keys), 2), dtype=np.uint32),
         "evidence": rng.integers(-3, 6, (len(keys), 64)).astype(np.int8),
     }
-    target.grid.put(VoxelData(keys, fields))
+    target.grid.add(VoxelData(keys, fields))
     return target
-
-
-def triangles(mesh: Mesh) -> np.ndarray:
-    """The corners of every face (F, 9), each from its lowest corner on, in order."""
-    corners = mesh.vertices[mesh.faces]  # (F, 3, 3)
-    lowest = np.lexsort(np.moveaxis(corners, 2, 0)[::-1], axis=-1)[:, :1]
-    turned = np.take_along_axis(corners, ((lowest + np.arange(3)) % 3)[..., None], axis=1)
-    rows = turned.reshape(-1, 9)
-    return rows[np.lexsort(rows.T[::-1])]
 
 
 def normals_by_place(mesh: Mesh) -> dict[bytes, np.ndarray]:

@@ -286,7 +286,7 @@ def test_cubes_left_out_have_no_part_in_the_mesh(resolution):
             "evidence": np.zeros((len(keys), 64), np.int8),
         },
     )
-    target.grid.put(voxels)
+    target.grid.add(voxels)
     meshes = []
     for codes, support in (
         meshing._cubes(target.grid, 14, resolution),

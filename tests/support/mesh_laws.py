@@ -28,3 +28,12 @@ def area_and_volume(vertices, faces) -> tuple[float, float]:
     return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2, np.einsum(
         "ni,ni->", a, np.cross(b, c)
     ) / 6
+
+
+def triangles(mesh) -> np.ndarray:
+    """The corners of every face (F, 9), each from its lowest corner on, in order."""
+    corners = mesh.vertices[mesh.faces]  # (F, 3, 3)
+    lowest = np.lexsort(np.moveaxis(corners, 2, 0)[::-1], axis=-1)[:, :1]
+    turned = np.take_along_axis(corners, ((lowest + np.arange(3)) % 3)[..., None], axis=1)
+    rows = turned.reshape(-1, 9)
+    return rows[np.lexsort(rows.T[::-1])]

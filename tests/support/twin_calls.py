@@ -17,6 +17,7 @@ PACKAGE = FOLDER.parents[1] / "taichi_unifusion"
 # Bookkeeping without a twin: tests in kernels/test_index.py, kernels/test_binning.py and
 # maps/test_meshing.py compare it with a dict, a set or a sum.
 BOOKKEEPING = {
+    "assign_slots",
     "claim_slots",
     "find_slots",
     "release_slots",
@@ -24,6 +25,7 @@ BOOKKEEPING = {
     "copy_rows",
     "forget_blocks",
     "gather_rows",
+    "scatter_rows",
 }
 
 _called: set[str] = set()  # in the test that runs now: "kernel NAME", "twin NAME"

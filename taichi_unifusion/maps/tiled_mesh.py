@@ -1,0 +1,93 @@
+"""The mesh of maps that lie in tiles, tile by tile: all pieces together are the mesh of the whole
+maps, vertex for vertex.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.triangles import areas
+from ..types import Mesh
+from .meshing import MESH_BLOCK, drop_small_parts, parts_by_pieces
+from .property_map import PropertyMap
+from .surface_map import SurfaceMap
+from .working_set import TILE, MapMemory, code_of, tile_of, tiles_around
+
+BLOCKS = np.array(list(product(range(TILE // MESH_BLOCK), repeat=3)), np.int32)  # of a tile
+
+
+def mesh_pieces(memory: MapMemory, resolution: int) -> Iterator[tuple[int, Mesh]]:
+    """The tiles with surface in order of their code, and the mesh of each with the values of every
+    property; vertices on the borders come with each tile that has them, equal to the bit.
+
+    Raises FileError or MapCorrupt where a tile cannot be read.
+    """
+    surfaces = memory.sets["surface"]
+    surface = surfaces.map
+    assert isinstance(surface, SurfaceMap)
+    surface.flush()
+    # cubes of the mesh span the centres of voxels, up to those of the tiles above
+    tiles = {code_of((i + a, j + b, k + c)) for code in surfaces.tiles()
+             for i, j, k in [tile_of(code)] for a, b, c in product((0, 1), repeat=3)}
+    for code in sorted(tiles):
+        memory.near("surface", set(tiles_around([code])))
+        blocks = np.array(tile_of(code), np.int32) * (TILE // MESH_BLOCK) + BLOCKS
+        mesh = surface.extract_mesh(resolution, blocks=blocks, flush=False)
+        if len(mesh.faces):
+            yield code, with_properties(memory, mesh)
+
+
+def with_properties(memory: MapMemory, mesh: Mesh) -> Mesh:
+    """A small mesh with the values of every property at its vertices."""
+    for name, each in memory.sets.items():
+        if isinstance(each.map, PropertyMap):
+            memory.near(name, each.codes(mesh.vertices))
+            mesh = mesh.with_attribute(name, each.map.query(mesh.vertices, flush=False))
+    return mesh
+
+
+def on_border(vertices: NDArray[np.float32], voxel_size: float) -> NDArray[np.bool_]:
+    """Which vertices (V, 3) lie where two tiles meet."""
+    places = vertices / voxel_size + 0.5  # in cubes of the mesh
+    return (np.abs(places / TILE - np.rint(places / TILE)) < 1e-5).any(axis=1)
+
+
+def parts_of_area(
+    vertices: NDArray[np.float32], faces: Callable[[], Iterable[NDArray[np.int32]]], least: float
+) -> NDArray[np.bool_]:
+    """Which vertices (V, 3) [m] belong to connected parts of at least so many square metres; `faces`
+    gives the triangles (F, 3) of the mesh, some at a time, each time that it is called.
+    """
+    part = parts_by_pieces(faces, len(vertices))
+    area = np.zeros(len(vertices))
+    for some in faces():
+        area += np.bincount(part[some[:, 0]], areas(vertices, some), len(vertices))
+    return area[part] >= least
+
+
+def joined_mesh(memory: MapMemory, resolution: int, min_area: float) -> Mesh:
+    """The mesh of all tiles at once, welded; parts of less than `min_area` square metres are left out."""
+    pieces = [mesh for _, mesh in mesh_pieces(memory, resolution)]
+    if not pieces:
+        return Mesh(*(np.zeros((0, 3), kind) for kind in (np.float32, np.int32, np.float32)))
+    vertices = np.concatenate([mesh.vertices for mesh in pieces])
+    _, first, number = np.unique(
+        vertices.view([("", vertices.dtype)] * 3).ravel(), return_index=True, return_inverse=True
+    )
+    # in order of their first coming
+    order = np.argsort(first)
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    rows, starts = first[order], np.cumsum([0, *(len(mesh.vertices) for mesh in pieces)])
+    faces = [mesh.faces + start for mesh, start in zip(pieces, starts, strict=False)]
+    attributes = {
+        name: np.concatenate([mesh.attributes[name] for mesh in pieces])[rows]
+        for name in pieces[0].attributes
+    }
+    normals = [mesh.normals for mesh in pieces if mesh.normals is not None]
+    faces = rank[number.reshape(-1)][np.concatenate(faces)].astype(np.int32)
+    return drop_small_parts(Mesh(vertices[rows], faces, np.concatenate(normals)[rows], attributes), min_area)
