@@ -144,7 +144,7 @@ def _fuse_and_write(
     recording, color = found_color(recording, color)
     frames = recording[:: options.recording.every]
     source = source_of(options.recording, len(frames), color)
-    pipeline = Pipeline(options.settings, encoder=encoder)
+    pipeline = Pipeline(options.settings, encoder=encoder, tiles=folder.map_folder)
     with frame_progress(len(frames)) as on_frame:
         run = pipeline.run(
             frames,

@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -32,8 +33,12 @@ class MeshStream:
         self._row: np.dtype | None = None
         self._comments: list[str] = []
         self._shared: dict[int, dict[bytes, int]] = {}  # by slab: vertices by their place
+        self._files = ExitStack()
         try:
-            self._rows, self._faces = (tempfile.TemporaryFile(dir=path.parent) for _ in range(2))
+            self._rows, self._faces = (
+                self._files.enter_context(tempfile.TemporaryFile(dir=path.parent))  # noqa: SIM115
+                for _ in range(2)
+            )
         except OSError as error:
             raise file_error("write", path, error) from error
 
@@ -41,8 +46,7 @@ class MeshStream:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._rows.close()
-        self._faces.close()
+        self._files.close()
 
     def add(self, mesh: Triangles, shared: NDArray[np.bool_], slab: int) -> None:
         """Append a piece; of its vertices, `shared` (V,) may be those of other pieces too."""

@@ -41,7 +41,8 @@ class TileFolder:
     """The tiles of one map in a folder."""
 
     def __init__(self, path: Path, manifest: Mapping[str, Any], tiles: dict[Tile, TileFile]):
-        self.path, self.manifest, self.tiles = path, dict(manifest), tiles
+        # as it comes back from a file
+        self.path, self.manifest, self.tiles = path, json.loads(json.dumps(manifest)), tiles
         self._turn = 1 + max((_turn_of(each.file) for each in tiles.values()), default=0)
 
     @classmethod
@@ -76,6 +77,11 @@ class TileFolder:
         return (Path(path) / INDEX).is_file()
 
     @property
+    def index(self) -> Path:
+        """The file that names the others."""
+        return self.path / INDEX
+
+    @property
     def voxels(self) -> int:
         """Voxels of all tiles."""
         return sum(each.voxels for each in self.tiles.values())
@@ -88,7 +94,7 @@ class TileFolder:
     @property
     def files(self) -> list[Path]:
         """The index and the tiles' files."""
-        return [self.path / INDEX, *(self.path / each.file for each in self.tiles.values())]
+        return [self.index, *(self.path / each.file for each in self.tiles.values())]
 
     def read(self, tile: Tile, check: Check) -> tuple[dict[str, NDArray], Path]:
         """The arrays of a tile, and the file that they come from; `check` is given that file and
@@ -135,7 +141,7 @@ class TileFolder:
     def _write_index(self) -> None:
         tiles = [{"tile": tile, **asdict(each)} for tile, each in sorted(self.tiles.items())]
         values = {"format": FORMAT, "format_version": FORMAT_VERSION, "map": self.manifest}
-        write_text(self.path / INDEX, json.dumps({**values, "tiles": tiles}) + "\n")
+        write_text(self.index, json.dumps({**values, "tiles": tiles}) + "\n")
 
 
 def map_bytes(path: Path) -> int:

@@ -31,8 +31,12 @@ def mesh_pieces(memory: MapMemory, resolution: int) -> Iterator[tuple[int, Mesh]
     assert isinstance(surface, SurfaceMap)
     surface.flush()
     # cubes of the mesh span the centres of voxels, up to those of the tiles above
-    tiles = {code_of((i + a, j + b, k + c)) for code in surfaces.tiles()
-             for i, j, k in [tile_of(code)] for a, b, c in product((0, 1), repeat=3)}
+    tiles = {
+        code_of((i + a, j + b, k + c))
+        for code in surfaces.tiles()
+        for i, j, k in [tile_of(code)]
+        for a, b, c in product((0, 1), repeat=3)
+    }
     for code in sorted(tiles):
         memory.near("surface", set(tiles_around([code])))
         blocks = np.array(tile_of(code), np.int32) * (TILE // MESH_BLOCK) + BLOCKS
@@ -90,4 +94,6 @@ def joined_mesh(memory: MapMemory, resolution: int, min_area: float) -> Mesh:
     }
     normals = [mesh.normals for mesh in pieces if mesh.normals is not None]
     faces = rank[number.reshape(-1)][np.concatenate(faces)].astype(np.int32)
-    return drop_small_parts(Mesh(vertices[rows], faces, np.concatenate(normals)[rows], attributes), min_area)
+    return drop_small_parts(
+        Mesh(vertices[rows], faces, np.concatenate(normals)[rows], attributes), min_area
+    )

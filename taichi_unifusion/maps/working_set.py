@@ -75,9 +75,11 @@ class WorkingSet:
         return dict(zip(codes.tolist(), counts.tolist(), strict=True))
 
     def write(self, codes: Iterable[int] | None = None) -> None:
-        """Write the tiles among `codes`, or all, that the folder lacks or has otherwise; raises
-        FileError.
+        """Write the tiles among `codes`, or all, that the folder lacks or has otherwise; frames that
+        wait to be fused come first. Raises FileError.
         """
+        if codes is None:
+            self.map.flush()
         held = self.sizes()
         wanted = set(held) | self.loaded if codes is None else set(codes)
         wanted = {code for code in wanted if code in self.changed or code not in self.loaded}
@@ -193,7 +195,6 @@ class MapMemory:
     def save(self) -> None:
         """Write all that the folders lack; raises FileError."""
         for each in self.sets.values():
-            each.map.flush()
             each.write()
 
 
@@ -204,7 +205,9 @@ def make_memory(limit: str, folder: str | Path | None) -> MapMemory | None:
     if not limit:
         return None
     if folder is None:
-        raise InputError("map_memory: name a folder for the tiles that do not fit: Pipeline(tiles=...)")
+        raise InputError(
+            "map_memory: name a folder for the tiles that do not fit: Pipeline(tiles=...)"
+        )
     return MapMemory(parse_bytes(limit, "map_memory"), Path(folder))
 
 

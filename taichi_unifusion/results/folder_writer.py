@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ..errors import FileError, InputError, UniFusionError
+from ..files.tiles import INDEX, TileFolder
 from .ownership import mark_unfinished, owned_files
 from .run_folder import RunFolder
 
@@ -88,4 +89,14 @@ class FolderWriter:
         """
         if self.folder.relative(file) not in (self.marked or owned_files(self.folder)):
             return
-        self.attempt(f"{file}: could not be removed", lambda: file.unlink(missing_ok=True))
+        gone = [file]
+        if file.name == INDEX:
+            tiles = self.attempt(f"{file}: could not be read", lambda: TileFolder.open(file.parent))
+            gone = [] if tiles is None else tiles.files
+        for each in gone:
+            self.attempt(
+                f"{each}: could not be removed", lambda each=each: each.unlink(missing_ok=True)
+            )
+        if file.name == INDEX:
+            with suppress(OSError):  # it holds something else
+                file.parent.rmdir()

@@ -61,7 +61,10 @@ def measure_run(
         ),
         maps={
             name: MapRecord(
-                target.voxel_size, _voxels(pipeline, name), target.memory_bytes, map_bytes(folder.saved_map(name))
+                target.voxel_size,
+                _voxels(pipeline, name),
+                target.memory_bytes,
+                map_bytes(folder.saved_map(name)),
             )
             for name, target in pipeline.maps.items()
         },

@@ -188,8 +188,10 @@ class RunFolder:
         folder.
         """
         path = PurePosixPath(name)
-        if path.is_absolute() or ".." in path.parts or "\0" in name or len(path.parts) > 2:
+        if path.is_absolute() or ".." in path.parts or "\0" in name or len(path.parts) > 3:
             return False
+        if len(path.parts) == 3:
+            return self.path / path == self.tiled_map(path.parts[1]) / INDEX
         if len(path.parts) == 2:
             return self.path / path == self.map(path.stem)
         fixed = (self.record, self.config, self.trajectory, self.color_camera, self.answers)

@@ -34,8 +34,9 @@ from .measure import first_frame_seconds, measure_run
 from .outlook import Outlook, look_at_mesh
 from .ownership import strangers
 from .property_files import looks_of, write_property_picture
-from .record import RunRecord, Seconds, Source, write_record
+from .record import MeshRecord, RunRecord, Seconds, Source, write_record
 from .run_folder import MESH_SUFFIXES, RunFolder
+from .tiled import PICTURE_RESOLUTION, write_mesh_by_tiles, write_tiles
 
 logger = logging.getLogger(__name__)
 
@@ -110,11 +111,16 @@ def write_results(
     _write_color_camera(writer, recording)
     logger.info("extracting the mesh")
     extracting = time.perf_counter()
-    mesh = writer.attempt(f"{folder.path}: the mesh could not be extracted", pipeline.extract_mesh)
+    resolution = PICTURE_RESOLUTION if pipeline.memory else None
+    mesh = writer.attempt(
+        f"{folder.path}: the mesh could not be extracted",
+        lambda: pipeline.extract_mesh(resolution),
+    )
     extracted = time.perf_counter()
     outlook = _find_outlook(writer, mesh, run, up)
+    size = None
     if mesh is not None:
-        _write_mesh_files(writer, mesh, pipeline, run, outlook)
+        size = _write_mesh_files(writer, mesh, pipeline, run, outlook)
         for name, look in looks_of(pipeline).items():
             _write_property(writer, mesh, name, look, pipeline, run, outlook)
     if not writer.failures:
@@ -128,7 +134,7 @@ def write_results(
     )
     record = measure_run(writer, pipeline, run, mesh, seconds, recording, tracking)
     record = record if outlook is None else outlook.kept_in(record)
-    record = replace(record, earlier_files=writer.of_others)
+    record = replace(record, earlier_files=writer.of_others, mesh=size or record.mesh)
     writer.write(folder.record, lambda path: write_record(path, record))
     return Results(folder.path, tuple(writer.files), tuple(writer.failures), record)
 
@@ -155,8 +161,11 @@ def _upright(outlook: Outlook | None) -> NDArray | None:
 
 def _write_maps(writer: FolderWriter, pipeline: Pipeline, run: RunResult) -> None:
     """Write every map; one that was never made, since no frame gave its values, is a failure."""
-    for name, made in pipeline.maps.items():
-        writer.write(writer.folder.map(name), made.save)
+    if pipeline.memory:
+        write_tiles(writer, pipeline.memory)
+    else:
+        for name, made in pipeline.maps.items():
+            writer.write(writer.folder.map(name), made.save)
     for name, reason in _first_lacking(run).items():
         if name not in pipeline.maps:
             writer.remove(writer.folder.map(name))
@@ -187,8 +196,11 @@ def _first_lacking(run: RunResult) -> dict[str, str]:
 
 def _write_mesh_files(
     writer: FolderWriter, mesh: Mesh, pipeline: Pipeline, run: RunResult, outlook: Outlook | None
-) -> None:
-    folder = writer.folder
+) -> MeshRecord | None:
+    """Write the mesh and a picture of it; returns its size where `mesh` is only a coarse one, because
+    the maps lie in tiles.
+    """
+    folder, size = writer.folder, None
     wanted = {folder.mesh_file(suffix) for suffix in pipeline.config.mesh.formats}
     if not len(mesh.faces):
         writer.failures.append(
@@ -198,7 +210,11 @@ def _write_mesh_files(
             )
         )
         wanted &= {folder.mesh}  # the other formats cannot hold an empty mesh
+    if pipeline.memory and len(mesh.faces):
+        size, wanted = write_mesh_by_tiles(writer, pipeline.memory, pipeline.config.mesh), set()
     for file in folder.meshes:
+        if size and file == folder.mesh:
+            continue
         if file in wanted:
             writer.write(file, lambda path: write_mesh(path, mesh, _upright(outlook)))
         else:
@@ -207,6 +223,7 @@ def _write_mesh_files(
         writer.write(folder.preview, lambda path: write_png(path, draw_views(mesh, outlook.views)))
     else:
         writer.remove(folder.preview)
+    return size
 
 
 def _write_property(

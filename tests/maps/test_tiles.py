@@ -18,7 +18,13 @@ from taichi_unifusion.maps.voxel_grid import VoxelData
 from taichi_unifusion.maps.working_set import TILE, code_of, key_codes, tile_of, tiles_around
 from taichi_unifusion.pipeline import Pipeline
 
-PLACES = (0, 20, 40, 0, 20)  # [m] along x of the box that frames are taken in: it is left and seen again
+PLACES = (
+    0,
+    20,
+    40,
+    0,
+    20,
+)  # [m] along x of the box that frames are taken in: it is left and seen again
 FRAMES = 6  # in each
 LIMITED = replace(CONFIG, map_memory="1MB")
 
@@ -94,7 +100,9 @@ def test_the_mesh_by_tiles_is_the_mesh_of_the_whole(whole, tiled):
     assert len(found.faces) > 1000 and len(found.vertices) == len(expected.vertices)
     np.testing.assert_array_equal(triangles(found), triangles(expected))
     order = [np.lexsort(mesh.vertices.T) for mesh in (found, expected)]
-    colors = [mesh.attributes["color"][rows] for mesh, rows in zip((found, expected), order)]
+    colors = [
+        mesh.attributes["color"][rows] for mesh, rows in zip((found, expected), order, strict=True)
+    ]
     np.testing.assert_array_equal(*colors)
 
 
@@ -139,7 +147,10 @@ def test_codes_of_tiles_are_one_to_one():
 
 
 def one_tile(n: int = 3) -> dict[str, np.ndarray]:
-    return {"keys": np.arange(3 * n, dtype=np.int32).reshape(n, 3), "weights": np.ones(n, np.float32)}
+    return {
+        "keys": np.arange(3 * n, dtype=np.int32).reshape(n, 3),
+        "weights": np.ones(n, np.float32),
+    }
 
 
 def test_a_tile_is_replaced_as_a_whole(tmp_path):
@@ -173,8 +184,14 @@ def test_what_cannot_be_written_leaves_the_tiles_as_they_were(tmp_path, monkeypa
     [
         ({"format": "other"}, "not the index"),
         ({"format_version": 2}, "version 2"),
-        ({"tiles": [{"tile": [0, 0, 0], "file": "../x.1.safetensors", "voxels": 1, "bytes": 1}]}, "damaged"),
-        ({"tiles": [{"tile": [0, 0], "file": "0_0_0.1.safetensors", "voxels": 1, "bytes": 1}]}, "damaged"),
+        (
+            {"tiles": [{"tile": [0, 0, 0], "file": "../x.1.safetensors", "voxels": 1, "bytes": 1}]},
+            "damaged",
+        ),
+        (
+            {"tiles": [{"tile": [0, 0], "file": "0_0_0.1.safetensors", "voxels": 1, "bytes": 1}]},
+            "damaged",
+        ),
         ({"tiles": 5}, "damaged"),
         ({"map": []}, "damaged"),
     ],

@@ -1,0 +1,55 @@
+"""What differs in a results folder whose maps lie in tiles: their folders, and a mesh that is written
+while it is made.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from ..config import MeshSettings
+from ..files.mesh_stream import MeshStream
+from ..maps.tiled_mesh import mesh_pieces, on_border, parts_of_area
+from ..maps.working_set import MapMemory, tile_of
+from .folder_writer import FolderWriter
+from .record import MeshRecord
+
+logger = logging.getLogger(__name__)
+PICTURE_RESOLUTION = 1  # cells a voxel of the mesh that pictures are drawn from
+
+
+def write_tiles(writer: FolderWriter, memory: MapMemory) -> None:
+    """Write what of the maps is in memory; their indices stand for all their files."""
+    for name, each in memory.sets.items():
+        writer.write(each.folder.index, lambda _, each=each: each.write())
+
+
+def write_mesh_by_tiles(
+    writer: FolderWriter, memory: MapMemory, settings: MeshSettings
+) -> MeshRecord | None:
+    """Write the mesh of all tiles as PLY, tile by tile; returns its size, None where that failed."""
+    path = writer.folder.mesh
+    if set(settings.formats) != {"ply"}:
+        logger.info(
+            "the mesh is written tile by tile, as PLY alone; `unifusion export` makes others"
+        )
+    size = writer.attempt(
+        f"{path}: could not be written", lambda: stream_mesh(path, memory, settings)
+    )
+    if size is not None:
+        writer.written.append(path)
+    return size
+
+
+def stream_mesh(path: Path, memory: MapMemory, settings: MeshSettings) -> MeshRecord:
+    """Write the mesh of all tiles as PLY, holding no more than a few tiles of it; parts of less than
+    `settings.min_area` are left out. Raises FileError or MapCorrupt.
+    """
+    voxel_size = memory.sets["surface"].map.voxel_size
+    with MeshStream(path) as stream:
+        for code, mesh in mesh_pieces(memory, settings.resolution):
+            stream.add(mesh, on_border(mesh.vertices, voxel_size), tile_of(code)[0])
+        kept = None
+        if settings.min_area > 0 and stream.triangles:
+            kept = parts_of_area(stream.places, stream.faces, settings.min_area)
+        return MeshRecord(*stream.write(kept))
