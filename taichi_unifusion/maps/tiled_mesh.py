@@ -56,8 +56,8 @@ def with_properties(memory: MapMemory, mesh: Mesh) -> Mesh:
 
 def on_border(vertices: NDArray[np.float32], voxel_size: float) -> NDArray[np.bool_]:
     """Which vertices (V, 3) lie where two tiles meet."""
-    places = vertices / voxel_size + 0.5  # in cubes of the mesh
-    return (np.abs(places / TILE - np.rint(places / TILE)) < 1e-5).any(axis=1)
+    places = (vertices / voxel_size + 0.5) / TILE  # cubes of the mesh begin half a voxel before
+    return np.any(np.abs(places - np.rint(places)) < 1e-5, axis=1)
 
 
 def parts_of_area(
@@ -77,7 +77,8 @@ def joined_mesh(memory: MapMemory, resolution: int, min_area: float) -> Mesh:
     """The mesh of all tiles at once, welded; parts of less than `min_area` square metres are left out."""
     pieces = [mesh for _, mesh in mesh_pieces(memory, resolution)]
     if not pieces:
-        return Mesh(*(np.zeros((0, 3), kind) for kind in (np.float32, np.int32, np.float32)))
+        none = np.zeros((0, 3), np.float32)
+        return Mesh(none, none.astype(np.int32), none)
     vertices = np.concatenate([mesh.vertices for mesh in pieces])
     _, first, number = np.unique(
         vertices.view([("", vertices.dtype)] * 3).ravel(), return_index=True, return_inverse=True

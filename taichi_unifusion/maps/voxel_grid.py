@@ -311,7 +311,8 @@ def _count_free(live: runtime.Runtime, tree: kernels.Index) -> int:
 def _clear_tree(tree: kernels.Index, device: str) -> None:
     """Take all voxels out of an index tree, whose memory stays with it."""
     if device == "cpu":
-        tree.leaf_parent.parent(2).deactivate_all()  # the topmost pointer node
+        topmost: Any = tree.leaf_parent.parent(2)  # pointer node
+        topmost.deactivate_all()
     else:  # there nodes that were given back are not safe to fill again (taichi#6401)
         tree.slot.fill(0)
         tree.stamp.fill(0)
