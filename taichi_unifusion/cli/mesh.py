@@ -50,7 +50,6 @@ def extract_mesh(options: ExtractMesh) -> int:
     """Saved maps -> mesh files, those of single properties included."""
     from ..files.atomic import check_writable
     from ..files.meshes import MESH_SUFFIXES, write_mesh
-    from ..files.tiles import read_any_manifest
 
     up = parse_up(options.up) if options.up else None
     folder = RunFolder(options.dir)

@@ -20,7 +20,7 @@ PICTURE_RESOLUTION = 1  # cells a voxel of the mesh that pictures are drawn from
 
 def write_tiles(writer: FolderWriter, memory: MapMemory) -> None:
     """Write what of the maps is in memory; their indices stand for all their files."""
-    for name, each in memory.sets.items():
+    for each in memory.sets.values():
         writer.write(each.folder.index, lambda _, each=each: each.write())
 
 

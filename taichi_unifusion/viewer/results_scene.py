@@ -18,7 +18,6 @@ from ..files.atomic import read_bytes
 from ..files.json_text import parse_json
 from ..files.mesh_reading import read_any_mesh, read_mesh
 from ..files.ply import color_to_uint8
-from ..files.tiles import read_any_map
 from ..files.trajectories import read_trajectory
 from ..geometry.triangles import SurfaceDistance
 from ..maps.stored import read_stored

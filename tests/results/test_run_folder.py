@@ -17,7 +17,8 @@ NAMES = re.compile(
     r"|query\.json|query-\S*\.|segmentation\.(json|ply|png)|maps/)|\.safetensors$"
 )
 SHOWN = ("metavar", "help", "help_behavior_hint")  # what --help says of a folder is no path
-FORMATS = ("files/maps.py",)  # names its own kind of file
+# these name their own kinds of files
+FORMATS = ("files/maps.py", "files/tiles.py", "datasets/open3d_system.py")
 
 
 def texts(tree: ast.AST) -> Iterator[tuple[int, str]]:
