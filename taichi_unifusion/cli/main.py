@@ -24,6 +24,7 @@ from tyro.conf import subcommand
 from ..config import Config, load_config
 from ..errors import FileError, UniFusionError, as_known, check_choice
 from .config import ShowConfig, show_config
+from .convert import Convert, convert
 from .evaluate import METRICS, Evaluate
 from .export import Export, export
 from .formats import ShowFormats, show_formats
@@ -60,6 +61,7 @@ COMMANDS: Commands = {
     "render": (Render, render),
     "mesh": (ExtractMesh, extract_mesh),
     "export": (Export, export),
+    "convert": (Convert, convert),
     "info": (Info, info),
     "formats": (ShowFormats, show_formats),
     "config": (ShowConfig, show_config),

@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from ..files.images import resize_color
 from ..types import Frame
 from .color_camera import ColorCamera
@@ -44,6 +45,12 @@ class CameraPair(Dataset):
         if camera is not None and camera.clock_offset and velocities is None:
             velocities = self.velocities()
         self.color_camera, self.twists, self.registered = camera, velocities, camera is not None
+
+    def recorded_color(self, index: int) -> NDArray[np.uint8] | None:
+        """The colour image of frame `index` as it was taken, (h, w, 3) RGB of any size; None where there is
+        none.
+        """
+        raise InputError(f"{self.name}: its colour images cannot be had as they were taken")
 
     def with_color(self, frame: Frame, color: NDArray[np.uint8], where: str) -> Frame:
         """The frame, which has no colour yet, with the colour image that was taken with it."""

@@ -103,6 +103,10 @@ class Recording(CameraPair):
             time = int(number[0]) / FRAME_RATE
         return time, files.pose.usable if files.pose else None
 
+    def recorded_color(self, index: int) -> NDArray[np.uint8] | None:
+        file = self.frames[index].color
+        return None if file is None else read_color(file, drop_alpha=self.drop_alpha)
+
     def load(self, index: int) -> Frame:
         """Read frame `index`; FrameError (PoseError, SizeMismatch) names the faulty file."""
         files = self.frames[index]

@@ -196,15 +196,21 @@ class RosbagRecording(CameraPair):
         frame = Frame(
             depth, lens.pinhole, None, T_world_camera, index, float(self.times[index]), where
         )
-        partner = int(self.partners[index])
-        if self.color_topic is None or partner < 0:
+        color = self.recorded_color(index)
+        if color is None:
             return frame
-        where = self._where(self.color_topic, partner)
-        color = read_color_message(self.bag.message(self.color_topic.name, partner), where)
         if self.registered and self.color_camera is None and any(lens.distortion):
             own = _resized(self.lens, (color.shape[1], color.shape[0]), where)
             color = np.asarray(own.undistort(color, own.pinhole), np.uint8)
         return self.with_color(frame, color, where)
+
+    def recorded_color(self, index: int) -> NDArray[np.uint8] | None:
+        topic, partner = self.color_topic, int(self.partners[index])
+        if topic is None or partner < 0:
+            return None
+        return read_color_message(
+            self.bag.message(topic.name, partner), self._where(topic, partner)
+        )
 
     def _where(self, topic: ImageTopic, number: int) -> str:
         return f"{self.path} {topic.name} message {number}"

@@ -218,6 +218,11 @@ def write_depth_png(path: str | os.PathLike[str], depth: NDArray[np.floating]) -
         temporary.write_bytes(content.tobytes())
 
 
+def encode_png(image: NDArray) -> bytes:
+    """A PNG file of grey (H, W) of 8 or 16 bits, or of blue, green and red (H, W, 3) of 8."""
+    return cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes()
+
+
 def _read_bytes(path: Path, count: int = -1) -> bytes:
     try:
         with open(path, "rb") as file:
