@@ -18,6 +18,7 @@ from ..geometry.gravity import Up, parse_up
 from ..tracking import check_poses, track
 from .color_camera import found_color, given_color
 from .interrupts import INTERRUPTED, stop_on_signal
+from .live import LiveOptions, reconstruct_live
 from .options import (
     OutputOptions,
     RecordingOptions,
@@ -48,6 +49,8 @@ class Reconstruct:
     Without camera poses: unifusion reconstruct folder my_recording --tracking rgbd --out
     results/mine
 
+    Of a camera that is connected: unifusion reconstruct realsense --live --out results/mine
+
     Settings that `unifusion config --help` explains are options here too,
 
     for example --device cpu, --surface.voxel-size 0.03 or --mesh.resolution 8.
@@ -57,11 +60,14 @@ class Reconstruct:
     poses: Annotated[TrackingOptions, arg(name="")]
     output: Annotated[OutputOptions, arg(name="")]
     watch: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+    live: Annotated[LiveOptions, arg(name="")] = field(default_factory=LiveOptions)
     settings: Settings = field(default_factory=Config, kw_only=True)
 
 
 def reconstruct(options: Reconstruct) -> int:
     """Frames -> maps -> mesh -> results folder."""
+    if options.live.live:
+        return reconstruct_live(options)
     return fuse(open_recording(options.recording), options)
 
 
@@ -79,11 +85,11 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
         up = Up(np.array(recording.up), "recording")
     folder = prepare_results(options.output.out)
     with lock_folder(folder):
-        _say_what_is_replaced(folder, options, encoder is not None)
+        say_what_is_replaced(folder, options, encoder is not None)
         return _fuse_watched(recording, color, options, folder, encoder, up)
 
 
-def _say_what_is_replaced(folder: RunFolder, options: Reconstruct, features: bool) -> None:
+def say_what_is_replaced(folder: RunFolder, options: Reconstruct, features: bool) -> None:
     """Warn where the folder holds an earlier run; raises FileError where it holds what is no run's."""
     from ..results.ownership import describe_earlier
     from ..results.writer import check_free

@@ -9,12 +9,17 @@ from functools import partial
 
 from ..types import Frame
 from .dataset import DatasetView
+from .live import Arriving
 
 
 def load_ahead(sequence: Sequence[Frame]) -> Iterator[Callable[[], Frame]]:
     """Yield one function for each frame, in order: it returns the frame, or raises what loading
-    the frame raised. A thread loads the next frame meanwhile.
+    the frame raised. A thread loads the next frame meanwhile. Frames that are still to come are waited
+    for.
     """
+    if isinstance(sequence, Arriving):
+        yield from sequence.arriving()
+        return
     # two threads must not launch kernels at once: load each frame in the caller's thread
     if getattr(recording_of(sequence), "runs_kernels", False):
         yield from (partial(sequence.__getitem__, i) for i in range(len(sequence)))

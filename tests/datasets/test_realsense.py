@@ -9,7 +9,7 @@ import pytest
 from dataset_writers import quaternion
 
 from taichi_unifusion.datasets import open_dataset
-from taichi_unifusion.datasets.realsense import inverse_distortion
+from taichi_unifusion.datasets.realsense_lens import inverse_distortion
 from taichi_unifusion.errors import DatasetError, FrameError
 from taichi_unifusion.types import PinholeCamera
 

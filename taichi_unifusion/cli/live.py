@@ -1,0 +1,181 @@
+"""`--live`: frames are mapped as they come, of a camera or of a recording at its own frame rate."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from ..datasets.live import LiveFrames, Replay
+from ..errors import InputError
+from ..geometry.gravity import parse_up
+from ..tracking import TrackingResult, check_poses, make_tracker
+from ..tracking.live import TrackedFrames
+from .color_camera import AUTO, given_color
+from .interrupts import INTERRUPTED, stop_on_signal
+from .options import RecordingOptions, merged_options, open_recording, source_of
+from .terminal import frame_progress, report
+from .viewing import open_watcher
+
+if TYPE_CHECKING:
+    from ..results import RunFolder
+    from ..results.record import Source
+    from ..run_log import RunResult
+    from ..viewer.null import Watcher
+    from .reconstruct import Reconstruct
+
+logger = logging.getLogger(__name__)
+CAMERAS = ("realsense",)  # formats that are also cameras
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """Whether frames are mapped as they come."""
+
+    live: FlagCreatePairsOff[bool] = False
+    """Map frames as they come: of the camera that is connected (realsense without a path), or of a recording at
+    its own frame rate. Of what comes meanwhile the newest frames wait, others are dropped and counted.
+    Ctrl-C ends it, and everything is written.
+    """
+    live_speed: Annotated[float, arg(metavar="FACTOR")] = 1.0
+    """How fast a recording comes with --live; 2 is twice its own frame rate."""
+
+
+@dataclass(frozen=True)
+class LiveSource:
+    """What frames come from."""
+
+    frames: Iterable[Any]
+    name: str
+    tracking: str  # mode of the tracker
+    record: Source | None  # None for a camera: nobody can open it again
+    most: int | None = None  # frames to take
+
+
+def reconstruct_live(options: Reconstruct) -> int:
+    """Frames -> tracker -> maps while they come, then mesh -> results folder."""
+    from ..pipeline import warm_up
+    from ..results.lock import lock_folder
+    from ..results.writer import prepare_results, remove_temporaries
+    from .reconstruct import say_what_is_replaced
+
+    source = open_source(options)
+    folder = prepare_results(options.output.out)
+    with lock_folder(folder):
+        say_what_is_replaced(folder, options, features=False)
+        with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
+            watcher = open_watcher(options.watch, folder.path.name, source.most or 0, stop)
+            warm_up(options.settings)  # or the first frames would be dropped while kernels are compiled
+            try:
+                code = _map(source, options, folder, stop, watcher)
+            except BaseException:
+                watcher.close()
+                raise
+        if code == INTERRUPTED:
+            watcher.close()
+        else:
+            watcher.finish(folder.path)
+    return code
+
+
+def open_source(options: Reconstruct) -> LiveSource:
+    """The camera, or the recording to be played; InputError for options that do not go together."""
+    asked, mode = options.recording, options.poses.tracking
+    if asked.path is None and asked.format in CAMERAS:
+        if asked.start or asked.every != 1:
+            raise InputError("--live: a camera has no frames to start from or to leave out; drop it")
+        if mode not in ("given", "rgbd"):
+            raise InputError(f"--live: a camera has no poses for --tracking {mode}; use rgbd")
+        from ..datasets.realsense_camera import RealsenseCamera
+
+        return LiveSource(
+            RealsenseCamera(align=_align(asked)), asked.format, "rgbd", None, asked.end
+        )
+    recording = open_recording(asked)
+    if mode not in ("given", "rgbd"):
+        raise InputError(f"--live: poses are given or found by rgbd, not by --tracking {mode}")
+    check_poses(recording, mode)
+    color = asked.color_camera
+    recording, known = given_color(recording, color)
+    frames = recording[:: asked.every]
+    replay = Replay(frames, options.live.live_speed)
+    record = source_of(asked, len(frames), None if color == AUTO else known)
+    return LiveSource(replay, recording.name, mode, record)
+
+
+def _align(asked: RecordingOptions) -> str:
+    """The only option of the format that a camera has, too."""
+    given = merged_options(asked.format, {}, asked.option)
+    for name in given:
+        if name != "align":
+            raise InputError(f"--live: a camera has no option '{name}', only align")
+    return given.get("align", "depth")
+
+
+def _map(
+    source: LiveSource,
+    options: Reconstruct,
+    folder: RunFolder,
+    stop: Callable[[], bool],
+    watcher: Watcher,
+) -> int:
+    from ..pipeline import Pipeline
+    from ..results.summary import summarize
+    from ..results.writer import write_results
+
+    settings, up = options.settings, options.output.up
+    pipeline = Pipeline(settings)
+    tracker = make_tracker(source.tracking, settings.tracking, settings.preprocess)  # type: ignore[arg-type]
+    logger.info("live: %s, tracking: %s; Ctrl-C ends it", source.name, source.tracking)
+    with (
+        LiveFrames(source.frames, source.name, stop=stop, most=source.most) as frames,
+        frame_progress(source.most or 0) as on_frame,
+    ):
+        run = pipeline.run(
+            TrackedFrames(frames, tracker),
+            strict=options.recording.strict,
+            stop=stop,
+            on_frame=on_frame,
+            on_step=watcher.on_step,
+            on_skip=watcher.on_skip,
+        )
+    said = f"{frames.received} frames came, {len(run.steps)} are mapped, {frames.dropped} were dropped"
+    logger.info("live: %s", said)
+    if not run.steps:
+        logger.warning("stopped before the first frame was done; nothing was written")
+        return INTERRUPTED
+    result = tracker.finish()
+    written = _write_tracking(folder, result) if source.tracking != "given" else ()
+    details = {
+        **result.details,
+        "mode": source.tracking,
+        "live": {"received": frames.received, "dropped": frames.dropped},
+        "verdicts": result.counts,
+        "seconds": round(run.seconds, 3),
+    }
+    up = parse_up(up) if up else None
+    results = write_results(folder.path, pipeline, run, source.record, details, written, up)
+    print(
+        json.dumps(results.record.to_json(), indent=2)
+        if options.output.json
+        else summarize(results.record, results.files, folder.path)
+    )
+    return _code(run, results.failures, stop)
+
+
+def _code(run: RunResult, failures: Iterable[Exception], stop: Callable[[], bool]) -> int:
+    code = report([error for error in (run.failure, *failures) if error])
+    return INTERRUPTED if stop() else code
+
+
+def _write_tracking(folder: RunFolder, result: TrackingResult) -> tuple:
+    from ..files.trajectories import write_trajectory
+    from ..tracking.sequence import write_tracking
+
+    write_tracking(folder.tracking, result)
+    write_trajectory(folder.tracked_poses, result.trajectory)
+    return folder.tracking_files
