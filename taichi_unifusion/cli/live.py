@@ -69,7 +69,9 @@ def reconstruct_live(options: Reconstruct) -> int:
         say_what_is_replaced(folder, options, features=False)
         with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
             watcher = open_watcher(options.watch, folder.path.name, source.most or 0, stop)
-            warm_up(options.settings)  # or the first frames would be dropped while kernels are compiled
+            warm_up(
+                options.settings
+            )  # or the first frames would be dropped while kernels are compiled
             try:
                 code = _map(source, options, folder, stop, watcher)
             except BaseException:
@@ -87,7 +89,9 @@ def open_source(options: Reconstruct) -> LiveSource:
     asked, mode = options.recording, options.poses.tracking
     if asked.path is None and asked.format in CAMERAS:
         if asked.start or asked.every != 1:
-            raise InputError("--live: a camera has no frames to start from or to leave out; drop it")
+            raise InputError(
+                "--live: a camera has no frames to start from or to leave out; drop it"
+            )
         if mode not in ("given", "rgbd"):
             raise InputError(f"--live: a camera has no poses for --tracking {mode}; use rgbd")
         from ..datasets.realsense_camera import RealsenseCamera
@@ -143,7 +147,9 @@ def _map(
             on_step=watcher.on_step,
             on_skip=watcher.on_skip,
         )
-    said = f"{frames.received} frames came, {len(run.steps)} are mapped, {frames.dropped} were dropped"
+    said = (
+        f"{frames.received} frames came, {len(run.steps)} are mapped, {frames.dropped} were dropped"
+    )
     logger.info("live: %s", said)
     if not run.steps:
         logger.warning("stopped before the first frame was done; nothing was written")
