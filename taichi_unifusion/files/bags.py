@@ -70,7 +70,9 @@ class Bag:
             for name, topic in part.topics.items():
                 self.topics.setdefault(name, topic)
         if not self.topics:
-            raise DatasetError("; ".join([f"{path}: holds no message of ROS", *self.damage]))
+            others = sorted({kind for part in self._parts for kind in getattr(part, "refused", ())})
+            said = [f"its messages are {', '.join(others)[:80]}"] if others else []
+            raise DatasetError("; ".join([f"{path}: holds no message of ROS", *said, *self.damage]))
         self._starts = {  # topic -> number of the first message of every part
             name: np.cumsum(
                 [0, *(len(p.times(name)) if name in p.topics else 0 for p in self._parts)]

@@ -85,11 +85,12 @@ class ChunkedBag(ABC):
     def __init__(self, path: Path) -> None:
         self.path, self.damage = path, ""
         try:
-            self._descriptor = os.open(path, os.O_RDONLY)
-            self.size = os.fstat(self._descriptor).st_size
+            self._stream = open(path, "rb", buffering=0)  # noqa: SIM115 - for as long as the bag is open
+            self.size = os.fstat(self._stream.fileno()).st_size
         except OSError as error:
             raise DatasetError(str(file_error("read", path, error))) from error
-        self.file = Span(lambda at, count: os.pread(self._descriptor, count, at), 0, self.size)
+        stream = self._stream
+        self.file = Span(lambda at, count: os.pread(stream.fileno(), count, at), 0, self.size)
         self.chunks: list[Chunk] = []
         self.topics: dict[str, BagTopic] = {}
         self.channels: dict[int, BagTopic] = {}
@@ -104,9 +105,7 @@ class ChunkedBag(ABC):
 
     def close(self) -> None:
         """Give the file back."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
+        self._stream.close()
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """When the messages of a topic were received [ns], ascending."""

@@ -6,7 +6,8 @@ import json
 
 import numpy as np
 import pytest
-from dataset_writers import CAMERA, make_samples, matrix_text, tum_row, write_image
+from dataset_writers import CAMERA, make_samples
+from open3d_writer import TRAJECTORIES, log_text, write_recording
 
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.errors import DatasetError, PoseError
@@ -15,42 +16,6 @@ from taichi_unifusion.errors import DatasetError, PoseError
 @pytest.fixture
 def samples():
     return make_samples(3)
-
-
-def write_recording(folder, samples, *, color="color", suffix=".png", camera="intrinsic.json"):
-    for i, sample in enumerate(samples):
-        write_image(folder / "depth" / f"{i:06d}.png", sample.units)
-        write_image(folder / color / f"{i:06d}{suffix}", sample.color)
-    if camera:
-        K = CAMERA.matrix.T.ravel().tolist()
-        values = {"width": CAMERA.width, "height": CAMERA.height, "intrinsic_matrix": K}
-        (folder / camera).write_text(json.dumps(values))
-    return folder
-
-
-def log_text(samples):
-    return "".join(
-        f"{i} {i} {i + 1}\n{matrix_text(s.T_world_camera)}" for i, s in enumerate(samples)
-    )
-
-
-def json_text(samples):
-    entries = [
-        {"extrinsic": np.linalg.inv(s.T_world_camera).T.ravel().tolist(), "intrinsic": {}}
-        for s in samples
-    ]
-    return json.dumps({"class_name": "PinholeCameraTrajectory", "parameters": entries})
-
-
-TRAJECTORIES = {
-    "trajectory.log": log_text,
-    "scene/trajectory.log": log_text,
-    "livingroom1-traj.txt": log_text,
-    "trajectory.json": json_text,
-    "trajectory.txt": lambda samples: "\n".join(
-        tum_row(s.T_world_camera, i) for i, s in enumerate(samples)
-    ),
-}
 
 
 def check_frames(dataset, samples):
