@@ -109,7 +109,8 @@ def files_in(folder: Path) -> list[str]:
             [],
             2,
             [
-                "reconstruct, transfer, understand, query, segment, view, render, mesh, export, convert, info, formats, config"
+                "reconstruct, transfer, understand, query, segment, view, render, mesh, export, convert,",
+                "info, formats, config",
             ],
         ),
         (
