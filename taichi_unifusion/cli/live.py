@@ -10,23 +10,31 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, arg
 
+from ..config import Config
 from ..datasets.live import LiveFrames, Replay
 from ..errors import InputError
 from ..geometry.gravity import parse_up
-from ..tracking import TrackingResult, check_poses, make_tracker
+from ..tracking import Mode, TrackingResult, check_poses, make_tracker
 from ..tracking.live import TrackedFrames
 from .color_camera import AUTO, given_color
 from .interrupts import INTERRUPTED, stop_on_signal
-from .options import RecordingOptions, merged_options, open_recording, source_of
+from .options import (
+    OutputOptions,
+    RecordingOptions,
+    TrackingOptions,
+    merged_options,
+    open_recording,
+    source_of,
+)
+from .replacing import say_what_is_replaced
 from .terminal import frame_progress, report
-from .viewing import open_watcher
+from .viewing import WatchOptions, open_watcher
 
 if TYPE_CHECKING:
     from ..results import RunFolder
     from ..results.record import Source
     from ..run_log import RunResult
     from ..viewer.null import Watcher
-    from .reconstruct import Reconstruct
 
 logger = logging.getLogger(__name__)
 CAMERAS = ("realsense",)  # formats that are also cameras
@@ -51,29 +59,33 @@ class LiveSource:
 
     frames: Iterable[Any]
     name: str
-    tracking: str  # mode of the tracker
+    tracking: Mode
     record: Source | None  # None for a camera: nobody can open it again
     most: int | None = None  # frames to take
 
 
-def reconstruct_live(options: Reconstruct) -> int:
+def reconstruct_live(
+    recording: RecordingOptions,
+    poses: TrackingOptions,
+    output: OutputOptions,
+    watch: WatchOptions,
+    live: LiveOptions,
+    settings: Config,
+) -> int:
     """Frames -> tracker -> maps while they come, then mesh -> results folder."""
     from ..pipeline import warm_up
     from ..results.lock import lock_folder
     from ..results.writer import prepare_results, remove_temporaries
-    from .reconstruct import say_what_is_replaced
 
-    source = open_source(options)
-    folder = prepare_results(options.output.out)
+    source = open_source(recording, poses.tracking, live.live_speed)
+    folder = prepare_results(output.out)
     with lock_folder(folder):
-        say_what_is_replaced(folder, options, features=False)
+        say_what_is_replaced(folder, output, settings, False, source.tracking != "given")
         with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
-            watcher = open_watcher(options.watch, folder.path.name, source.most or 0, stop)
-            warm_up(
-                options.settings
-            )  # or the first frames would be dropped while kernels are compiled
+            watcher = open_watcher(watch, folder.path.name, source.most or 0, stop)
+            warm_up(settings)  # or the first frames would be dropped while kernels are compiled
             try:
-                code = _map(source, options, folder, stop, watcher)
+                code = _map(source, recording.strict, output, settings, folder, stop, watcher)
             except BaseException:
                 watcher.close()
                 raise
@@ -84,9 +96,8 @@ def reconstruct_live(options: Reconstruct) -> int:
     return code
 
 
-def open_source(options: Reconstruct) -> LiveSource:
+def open_source(asked: RecordingOptions, mode: Mode, speed: float) -> LiveSource:
     """The camera, or the recording to be played; InputError for options that do not go together."""
-    asked, mode = options.recording, options.poses.tracking
     if asked.path is None and asked.format in CAMERAS:
         if asked.start or asked.every != 1:
             raise InputError(
@@ -96,19 +107,16 @@ def open_source(options: Reconstruct) -> LiveSource:
             raise InputError(f"--live: a camera has no poses for --tracking {mode}; use rgbd")
         from ..datasets.realsense_camera import RealsenseCamera
 
-        return LiveSource(
-            RealsenseCamera(align=_align(asked)), asked.format, "rgbd", None, asked.end
-        )
+        camera = RealsenseCamera(align=_align(asked))
+        return LiveSource(camera, asked.format, "rgbd", None, asked.end)
     recording = open_recording(asked)
     if mode not in ("given", "rgbd"):
         raise InputError(f"--live: poses are given or found by rgbd, not by --tracking {mode}")
     check_poses(recording, mode)
-    color = asked.color_camera
-    recording, known = given_color(recording, color)
+    recording, known = given_color(recording, asked.color_camera)
     frames = recording[:: asked.every]
-    replay = Replay(frames, options.live.live_speed)
-    record = source_of(asked, len(frames), None if color == AUTO else known)
-    return LiveSource(replay, recording.name, mode, record)
+    record = source_of(asked, len(frames), None if asked.color_camera == AUTO else known)
+    return LiveSource(Replay(frames, speed), recording.name, mode, record)
 
 
 def _align(asked: RecordingOptions) -> str:
@@ -122,7 +130,9 @@ def _align(asked: RecordingOptions) -> str:
 
 def _map(
     source: LiveSource,
-    options: Reconstruct,
+    strict: bool,
+    output: OutputOptions,
+    settings: Config,
     folder: RunFolder,
     stop: Callable[[], bool],
     watcher: Watcher,
@@ -131,9 +141,8 @@ def _map(
     from ..results.summary import summarize
     from ..results.writer import write_results
 
-    settings, up = options.settings, options.output.up
     pipeline = Pipeline(settings)
-    tracker = make_tracker(source.tracking, settings.tracking, settings.preprocess)  # type: ignore[arg-type]
+    tracker = make_tracker(source.tracking, settings.tracking, settings.preprocess)
     logger.info("live: %s, tracking: %s; Ctrl-C ends it", source.name, source.tracking)
     with (
         LiveFrames(source.frames, source.name, stop=stop, most=source.most) as frames,
@@ -141,7 +150,7 @@ def _map(
     ):
         run = pipeline.run(
             TrackedFrames(frames, tracker),
-            strict=options.recording.strict,
+            strict=strict,
             stop=stop,
             on_frame=on_frame,
             on_step=watcher.on_step,
@@ -163,11 +172,11 @@ def _map(
         "verdicts": result.counts,
         "seconds": round(run.seconds, 3),
     }
-    up = parse_up(up) if up else None
+    up = parse_up(output.up) if output.up else None
     results = write_results(folder.path, pipeline, run, source.record, details, written, up)
     print(
         json.dumps(results.record.to_json(), indent=2)
-        if options.output.json
+        if output.json
         else summarize(results.record, results.files, folder.path)
     )
     return _code(run, results.failures, stop)

@@ -27,6 +27,7 @@ from .options import (
     open_recording,
     source_of,
 )
+from .replacing import say_what_is_replaced
 from .terminal import DONE, FAILED, frame_progress, report
 from .viewing import WatchOptions, open_watcher
 
@@ -67,7 +68,14 @@ class Reconstruct:
 def reconstruct(options: Reconstruct) -> int:
     """Frames -> maps -> mesh -> results folder."""
     if options.live.live:
-        return reconstruct_live(options)
+        return reconstruct_live(
+            options.recording,
+            options.poses,
+            options.output,
+            options.watch,
+            options.live,
+            options.settings,
+        )
     return fuse(open_recording(options.recording), options)
 
 
@@ -85,23 +93,10 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
         up = Up(np.array(recording.up), "recording")
     folder = prepare_results(options.output.out)
     with lock_folder(folder):
-        say_what_is_replaced(folder, options, encoder is not None)
-        return _fuse_watched(recording, color, options, folder, encoder, up)
-
-
-def say_what_is_replaced(folder: RunFolder, options: Reconstruct, features: bool) -> None:
-    """Warn where the folder holds an earlier run; raises FileError where it holds what is no run's."""
-    from ..results.ownership import describe_earlier
-    from ..results.writer import check_free
-
-    if not options.output.overwrite:
-        check_free(folder, options.settings, features, options.poses.tracked)
-    if earlier := describe_earlier(folder):
-        logger.warning(
-            "%s holds %s: this run replaces it when it is done; another --out keeps it",
-            folder.path,
-            earlier,
+        say_what_is_replaced(
+            folder, options.output, options.settings, encoder is not None, options.poses.tracked
         )
+        return _fuse_watched(recording, color, options, folder, encoder, up)
 
 
 def _fuse_watched(
