@@ -39,6 +39,10 @@ FORMATS = {  # name -> module here, what opens a recording
     "strayscanner": ("strayscanner", "open_strayscanner"),
     "polycam": ("polycam", "open_polycam"),
     "nerfstudio": ("nerfstudio", "open_nerfstudio"),
+    "arkitscenes": ("arkitscenes", "open_arkitscenes"),
+    "scannetpp": ("scannetpp", "open_scannetpp"),
+    "hypersim": ("hypersim", "open_hypersim"),
+    "matterport": ("matterport", "open_matterport"),
     "open3d": ("open3d_system", "open_open3d"),
     "realsense": ("realsense", "open_realsense"),
     "rosbag": ("rosbag", "open_rosbag"),
@@ -141,7 +145,7 @@ def known_format(format: str, path: str | Path | None) -> str:
     from .detection import find_format
 
     found = find_format(Path(path).expanduser(), FORMATS)
-    logger.info("format %s, known by %s", found.format, found.sign)
+    logger.info("format %s: found %s", found.format, found.sign)
     return found.format
 
 

@@ -51,6 +51,7 @@ ELSEWHERE = {
     *("synthetic", "scene"),  # rendered
     "k4a",  # test_k4a.py
     *("record3d", "strayscanner", "polycam", "nerfstudio"),  # test_phones.py
+    *("arkitscenes", "scannetpp", "hypersim", "matterport"),  # test_phones.py
     *("open3d", "realsense", "rosbag"),  # test_open3d_system.py, test_realsense.py, test_rosbag.py
 }
 

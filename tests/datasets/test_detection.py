@@ -32,6 +32,8 @@ PHONES = {
     "r3d": ("record3d", phone_writers.write_r3d),
     "polycam": ("polycam", phone_writers.write_polycam),
     "nerfstudio": ("nerfstudio", phone_writers.write_transforms),
+    "arkitscenes": ("arkitscenes", phone_writers.write_arkitscenes),
+    "matterport": ("matterport", phone_writers.write_matterport),
 }
 
 

@@ -20,6 +20,7 @@ ROUNDED = 0.00055
 # of 255: JPEG, HEVC, and the mean over a pixel of depth instead of its centre
 COLOR_ERROR = 6.0
 LENS_ERROR = 0.002  # [m] of depth that is interpolated between the pixels of a distorted image
+HALF_FLOAT = 0.001  # [m] of distances up to 2 m with 11 bits
 
 
 def check(frames, truth: list[View], error: float = ROUNDED) -> None:
@@ -141,6 +142,39 @@ def test_transforms_json_of_a_lens(tmp_path, kind):
     check(list(open_dataset("nerfstudio", tmp_path)), shots, LENS_ERROR)
 
 
+def test_arkitscenes(tmp_path):
+    shots = views(count=5)
+    phone_writers.write_arkitscenes(tmp_path, shots, every=2)
+    recording = open_dataset("arkitscenes", tmp_path)
+    check(list(recording), shots[::2])
+    assert "2 of 5 depth images have no pose within 0.005 s" in recording.warnings[0]
+
+
+@pytest.mark.parametrize("packing", ["stream", "lz4", "deflate"])
+def test_scannetpp(tmp_path, packing):
+    pytest.importorskip("av"), pytest.importorskip("lz4")
+    shots = phone_writers.iphone_views()
+    recording = open_dataset("scannetpp", phone_writers.write_scannetpp(tmp_path, shots, packing))
+    check(list(recording), shots)
+    check([recording[i] for i in (2, 0, 1)], [shots[i] for i in (2, 0, 1)])
+
+
+def test_matterport(tmp_path):
+    shots = views(count=3)
+    seen = [view_of(shots[0].camera, shot) for shot in shots]  # a camera has one file
+    write_seen = [phone_writers.through_lens(shot, "brown") for shot in seen]
+    recording = open_dataset("matterport", phone_writers.write_matterport(tmp_path, write_seen))
+    check(list(recording), seen, LENS_ERROR)
+
+
+def test_hypersim(tmp_path):
+    pytest.importorskip("h5py")
+    shots = phone_writers.hypersim_views()
+    recording = open_dataset("hypersim", phone_writers.write_hypersim(tmp_path, shots))
+    check(list(recording), shots, HALF_FLOAT)
+    assert recording.up == (0, 0, 1)
+
+
 def test_depth_of_an_unknown_unit_is_refused(tmp_path):
     phone_writers.write_transforms(tmp_path, views(), "instant-ngp")
     file = tmp_path / "transforms.json"
@@ -156,6 +190,7 @@ WRITERS = {
     "record3d": phone_writers.write_r3d,
     "polycam": phone_writers.write_polycam,
     "strayscanner": phone_writers.write_strayscanner,
+    "arkitscenes": phone_writers.write_arkitscenes,
 }
 
 

@@ -283,3 +283,134 @@ def deflated(data: bytes) -> bytes:
     """Raw deflate, without a header."""
     packer = zlib.compressobj(wbits=-15)
     return packer.compress(data) + packer.flush()
+
+
+def write_arkitscenes(
+    folder: Path, shots: list[View], confidence: NDArray | None = None, every: int = 1
+) -> Path:
+    """Colour of depth's size; the trajectory has every so many-th frame."""
+    rows = []
+    for i, shot in enumerate(shots):
+        stamp = f"{6845.123 + 0.0167 * i:.3f}"
+        height, width = shot.depth.shape
+        small = shot.camera.resized(width, height)
+        name = f"41069021_{stamp}"
+        shrunk = cv2.resize(shot.color, (width, height), interpolation=cv2.INTER_AREA)
+        png(folder / "lowres_wide" / f"{name}.png", shrunk[..., ::-1])
+        png(folder / "lowres_depth" / f"{name}.png", shot.millimetres)
+        # the stamp of a camera may be a millisecond off
+        late = f"41069021_{float(stamp) + 0.001:.3f}.pincam" if i % 2 else f"{name}.pincam"
+        values = " ".join(map(repr, (width, height, *small.intrinsics)))
+        write(folder / "lowres_wide_intrinsics" / late, values)
+        if confidence is not None:
+            png(folder / "confidence" / f"{name}.png", confidence.astype(np.uint8))
+        if i % every == 0:
+            T = se3.inverse(shot.T_world_camera)
+            turn = cv2.Rodrigues(T[:3, :3])[0].ravel()
+            rows.append(
+                " ".join(map(repr, [float(stamp) + 0.002, *turn.tolist(), *T[:3, 3].tolist()]))
+            )
+    write(folder / "lowres_wide.traj", "\n".join(rows))
+    return folder
+
+
+# [pixels] the file says nothing of its images' size: that of an iPhone's depth
+IPHONE = (256, 192)
+
+
+def iphone_views(count: int = 3) -> list[View]:
+    """Views whose depth is as large as ScanNet++ has it; colour is as large."""
+    found = []
+    for i, shot in enumerate(views(count=count)):
+        camera = PinholeCamera(*IPHONE, 212.0 + i, 212.0 + i, 128.0, 95.0 + i)
+        exact = depth_of(camera, shot.T_world_camera)
+        T = shot.T_world_camera
+        points = camera.rays() * exact[..., None] @ T[:3, :3].T + T[:3, 3]
+        color = np.rint(color_at(points)).astype(np.uint8)
+        found.append(View(exact.astype(np.float32), color, camera, T))
+    return found
+
+
+def write_scannetpp(folder: Path, shots: list[View], packing: str = "stream") -> Path:
+    """`packing` of depth: stream (all as one), lz4 or deflate (each by itself)."""
+    root, frames = folder / "iphone", {}
+    write_video(root / "rgb.mkv", [shot.color for shot in shots])
+    images = []
+    for i, shot in enumerate(shots):
+        camera = shot.camera
+        frames[f"frame_{i:06}"] = {
+            "aligned_pose": shot.T_world_camera.tolist(),
+            "pose": np.eye(4).tolist(),
+            "intrinsic": camera.matrix.ravel().tolist(),
+            "timestamp": 100 + i / 60,
+        }
+        if packing == "lz4":
+            import lz4.block
+
+            images.append(lz4.block.compress(shot.millimetres.tobytes(), store_size=False))
+        elif packing == "deflate":
+            images.append(deflated(shot.depth.tobytes()))
+    write(root / "pose_intrinsic_imu.json", json.dumps(frames))
+    if packing == "stream":
+        write(root / "depth.bin", deflated(b"".join(shot.depth.tobytes() for shot in shots)))
+    else:
+        write(root / "depth.bin", b"".join(struct.pack("<I", len(x)) + x for x in images))
+    return folder
+
+
+def write_matterport(folder: Path, shots: list[View], kind: str = "brown") -> Path:
+    lens = LENSES[kind]
+    for i, shot in enumerate(shots):
+        name, camera = b"17DRP5sb8fy".hex().ljust(32, "0"), shot.camera
+        units = np.rint(4000 * shot.depth).astype(np.uint16)
+        png(folder / "matterport_depth_images" / f"{name}_d0_{i}.png", units)
+        write(folder / "matterport_color_images" / f"{name}_i0_{i}.jpg", jpeg(shot.color))
+        rows = "\n".join(" ".join(map(repr, row)) for row in shot.T_world_camera.tolist())
+        write(folder / "matterport_camera_poses" / f"{name}_pose_0_{i}.txt", rows)
+        numbers = (camera.width, camera.height, *camera.intrinsics)
+        numbers += (lens["k1"], lens["k2"], lens["p1"], lens["p2"], 0.0)
+        file = folder / "matterport_camera_intrinsics" / f"{name}_intrinsics_0.txt"
+        write(file, " ".join(map(repr, numbers)))
+    return folder
+
+
+METRES_A_UNIT = 0.0254
+
+
+def hypersim_views(count: int = 3) -> list[View]:
+    """Views of a camera with a field of view of 60 degrees; colour is as large as depth."""
+    found = []
+    width, height = 48, 36
+    focal = 0.5 * width / np.tan(np.pi / 6)
+    camera = PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    for shot in views(count=count):
+        T, exact = shot.T_world_camera, depth_of(camera, shot.T_world_camera)
+        points = camera.rays() * exact[..., None] @ T[:3, :3].T + T[:3, 3]
+        color = np.rint(color_at(points)).astype(np.uint8)
+        found.append(View(exact.astype(np.float32), color, camera, T))
+    return found
+
+
+def write_hypersim(folder: Path, shots: list[View]) -> Path:
+    import h5py
+
+    def hdf5(path: Path, values: NDArray) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with h5py.File(path, "w") as file:
+            file["dataset"] = values
+
+    write(
+        folder / "_detail" / "metadata_scene.csv",
+        f"parameter_name,parameter_value\nmeters_per_asset_unit,{METRES_A_UNIT}\n",
+    )
+    detail = folder / "_detail" / "cam_00"
+    T = np.array([shot.T_arkit for shot in shots])
+    hdf5(detail / "camera_keyframe_orientations.hdf5", T[:, :3, :3])
+    hdf5(detail / "camera_keyframe_positions.hdf5", T[:, :3, 3] / METRES_A_UNIT)
+    for i, shot in enumerate(shots):
+        distance = shot.depth * np.linalg.norm(shot.camera.rays(), axis=-1)
+        geometry = folder / "images" / "scene_cam_00_geometry_hdf5"
+        hdf5(geometry / f"frame.{i:04}.depth_meters.hdf5", distance.astype(np.float16))
+        preview = folder / "images" / "scene_cam_00_final_preview"
+        write(preview / f"frame.{i:04}.tonemap.jpg", jpeg(shot.color))
+    return folder
