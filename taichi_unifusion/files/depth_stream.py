@@ -72,30 +72,30 @@ class DepthStream:
         return self._image(np.frombuffer(metres, "<f4"))
 
     def _streamed(self, number: int) -> NDArray[np.float32]:
-        before = [place for place in self._places if place.number <= number]
-        if not self._now.number <= number or before[-1].number > self._now.number:
+        image, before = b"", [place for place in self._places if place.number <= number]
+        if not before[-1].number <= self._now.number <= number:
             self._now = before[-1]
-        count = 4 * self.size[0] * self.size[1]
-        place = self._now
+        while self._now.number <= number:
+            image, self._now = self._next(self._now)
+            if self._now.number % EVERY == 0 and self._places[-1].number < self._now.number:
+                self._places.append(self._now)
+        return self._image(np.frombuffer(image, "<f4"))
+
+    def _next(self, place: _Place) -> tuple[bytes, _Place]:
+        """The image of the one stream that begins at a place, and the place behind it."""
+        count, image = 4 * self.size[0] * self.size[1], bytearray()
+        unpacker, rest, offset = place.unpacker.copy(), place.rest, place.offset
         with open(self.path, "rb") as file:
-            file.seek(place.offset)
-            unpacker, rest, offset = place.unpacker.copy(), place.rest, place.offset
-            for at in range(place.number, number + 1):
-                image = bytearray()
-                while len(image) < count:
-                    if not rest:
-                        rest = file.read(CHUNK)
-                        offset += len(rest)
-                        if not rest or unpacker.eof:
-                            raise ValueError(f"there are {at} images")
-                    image += unpacker.decompress(rest, count - len(image))
-                    rest = unpacker.unconsumed_tail
-                    if unpacker.eof and len(image) < count:
-                        raise ValueError(f"there are {at} images")
-                self._now = _Place(at + 1, offset, unpacker.copy(), rest)
-                if (at + 1) % EVERY == 0 and self._places[-1].number < at + 1:
-                    self._places.append(self._now)
-        return self._image(np.frombuffer(bytes(image), "<f4"))
+            file.seek(offset)
+            while len(image) < count:
+                if not rest:
+                    rest = file.read(CHUNK)
+                    offset += len(rest)
+                if not rest or unpacker.eof:
+                    raise ValueError(f"there are {place.number} images")
+                image += unpacker.decompress(rest, count - len(image))
+                rest = unpacker.unconsumed_tail
+        return bytes(image), _Place(place.number + 1, offset, unpacker.copy(), rest)
 
     def _image(self, values: NDArray) -> NDArray[np.float32]:
         width, height = self.size

@@ -33,7 +33,7 @@ def read_hdf5(path: Path, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
     try:
         with h5py.File(path, "r") as file:
             found = file[NAME]
-            if not isinstance(found, h5py.Dataset) or found.size > MAX_PIXELS:
+            if not isinstance(found, h5py.Dataset) or not (found.size or 0) <= MAX_PIXELS:
                 raise FrameError(f"{path}: '{NAME}' is no array of at most {MAX_PIXELS} numbers")
             array = np.asarray(found[()], np.float64)
     except FrameError:
