@@ -48,6 +48,7 @@ class SceneDataset(Dataset):
             name,
         )
         self.camera = camera or kinect_camera()
+        self.warnings = scene.warnings
         of_object = [(classes or {}).get(item, item) for item in scene.object_names]
         self.class_names = tuple(sorted(set(of_object)))
         self.class_of_object = np.array(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +23,7 @@ from .. import runtime
 from ..errors import CapacityError, DatasetError, MissingDependency, UniFusionError
 from ..files.atomic import read_bytes
 from ..files.glb_reading import parse_own_glb
+from ..files.obj_materials import read_obj_materials
 from ..files.srgb import linear_to_srgb
 from ..types import Mesh, PinholeCamera, check_rigid
 from .depth_buffer import DepthBuffer, draw_depth_buffer
@@ -58,6 +59,7 @@ class TexturedScene:
     face_object: NDArray[np.int32]  # (F,)
     object_names: tuple[str, ...]
     textures: tuple[NDArray[np.uint8], ...]  # (h, w, 3) RGB each
+    warnings: tuple[str, ...] = ()  # what of its look could not be read
 
     def mesh(self) -> Mesh:
         """The exact surface, hidden parts included."""
@@ -201,7 +203,8 @@ def load_scene(path: str | Path) -> TexturedScene:
         own = parse_own_glb(read_bytes(path)) if Path(path).suffix.lower() == ".glb" else None
         if own is not None and "color" in own[0].attributes:
             return _colored(own[0])
-        scene: Any = trimesh.load(str(path), force="scene", process=False)
+        files = _files_of(Path(path))
+        scene: Any = trimesh.load(str(path), force="scene", process=False, resolver=files)
         # sorted: the same order in every run
         placed = [(name, *scene.graph[name]) for name in sorted(scene.graph.nodes_geometry)]
         parts = [
@@ -211,13 +214,36 @@ def load_scene(path: str | Path) -> TexturedScene:
         ]
         if own is not None:  # upright for viewers only
             parts = [(name, np.eye(4), mesh) for name, _, mesh in parts]
-        return _assemble(path, parts, linear=_is_gltf(path))
+        return replace(_assemble(path, parts, linear=_is_gltf(path)), warnings=files.warnings)
     except UniFusionError:
         raise
     except Exception as error:  # a damaged file fails anywhere in its parser
         raise DatasetError(
             f"{path}: not a scene that can be read ({type(error).__name__}: {error})"
         ) from error
+
+
+def _files_of(path: Path) -> Any:
+    """What gives trimesh the files that a scene names, and keeps sentences on those that are
+    missing, where trimesh would be silent.
+    """
+    from trimesh.resolvers import FilePathResolver
+
+    materials = read_obj_materials(path) if path.suffix.lower() == ".obj" else None
+
+    class Files(FilePathResolver):
+        warnings: tuple[str, ...] = materials.warnings if materials else ()
+
+        def get(self, name: str) -> bytes:
+            if materials:
+                return read_bytes(name) if name in materials.textures else materials.text.encode()
+            try:
+                return super().get(name)
+            except (OSError, ValueError):
+                self.warnings += (f"{path}: its file {name} is not there; what it covers is plain",)
+                raise
+
+    return Files(str(path))
 
 
 def _is_gltf(path: str | Path) -> bool:
