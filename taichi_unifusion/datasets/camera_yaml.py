@@ -24,7 +24,8 @@ class CameraFile:
     fy: float
     cx: float
     cy: float
-    depth_scale: float = 1000.0  # units a metre of integer depth images
+    # units a metre; None: 1000 of integer depth images, 1 of floats
+    depth_scale: float | None = None
     depth_invalid: tuple[int, ...] = INVALID_DEPTH  # units that mean no reading
     poses: str | None = None  # file or folder beside camera.yaml
 

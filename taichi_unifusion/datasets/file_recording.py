@@ -22,6 +22,7 @@ from ..errors import DatasetError, FrameError, InputError
 from ..files.images import (
     INVALID_DEPTH,
     depth_file_size,
+    holds_floats,
     read_color,
     read_depth,
     read_infrared,
@@ -51,8 +52,8 @@ class FrameFiles:
 class Recording(CameraPair):
     """Frames read from files when indexed.
 
-    `depth_scale` is in units a metre, `invalid` the units that mean no reading, `fit_color`
-    resamples colour of another size, `no_poses` says what is missing where no frame has a pose.
+    `depth_scale` is in units a metre, `float_scale` the same for arrays of floats, `invalid` the
+    units that mean no reading, `fit_color` resamples colour of another size, `no_poses` says what is missing where no frame has a pose.
     `color_camera` is the colour camera's own, where colour is not registered to depth yet.
     """
 
@@ -69,9 +70,11 @@ class Recording(CameraPair):
         warnings: Iterable[str] = (),
         no_poses: str = "",
         color_camera: ColorCamera | None = None,
+        float_scale: float = 1.0,
     ) -> None:
         self.name, self.frames, self.camera = name, tuple(frames), camera
         self.depth_scale = check_depth_scale(depth_scale, name)
+        self.float_scale = check_depth_scale(float_scale, name)
         self.invalid, self.fit_color, self.drop_alpha = tuple(invalid), fit_color, drop_alpha
         poses = [frame.pose for frame in self.frames if frame.pose is not None]
         self.no_poses = no_poses
@@ -107,12 +110,18 @@ class Recording(CameraPair):
         file = self.frames[index].color
         return None if file is None else read_color(file, drop_alpha=self.drop_alpha)
 
+    def scale_of(self, index: int) -> float:
+        """Units of frame `index` that make a metre; FrameError where its depth cannot be read."""
+        return self.float_scale if holds_floats(self.frames[index].depth) else self.depth_scale
+
     def load(self, index: int) -> Frame:
         """Read frame `index`; FrameError (PoseError, SizeMismatch) names the faulty file."""
         files = self.frames[index]
         T_world_camera = files.pose.checked() if files.pose else None
         size = self.camera.width, self.camera.height
-        depth = read_depth(files.depth, self.depth_scale, self.invalid, size)
+        depth = read_depth(
+            files.depth, self.depth_scale, self.invalid, size, float_scale=self.float_scale
+        )
         frame = Frame(
             depth,
             self.camera,

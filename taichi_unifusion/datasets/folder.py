@@ -2,7 +2,8 @@
 poses.
 
 Depth: `depth/NAME.png`, 16 bits, `depth_scale` units a metre (default 1000), 0 and 65535 no
-reading; or `depth/NAME.npy`, floats in metres. Colour: `color/NAME.png` or `.jpg`, registered to
+reading; or `depth/NAME.npy`, (H, W) or (H, W, 1), integers of the same units, or floats, which are
+metres unless a depth_scale is given. Colour: `color/NAME.png` or `.jpg`, registered to
 depth, where another size of the same shape is resampled, or, beside a `color_camera.yaml`, as that
 camera took it. Frames are the names, in the order of the numbers in them. Infrared, if any:
 `infrared/NAME.png`, one channel of 8 or 16 bits, registered to depth, for the frames that have one.
@@ -37,6 +38,7 @@ DEPTH_SUFFIXES, COLOR_SUFFIXES, INFRARED_SUFFIXES = (
     (".png",),
 )
 MAX_DIFFERENCE = 0.02  # [s]
+DEPTH_SCALE = 1000.0  # units a metre of integers, where nothing says otherwise
 CAMERA_FILE, COLOR_CAMERA_FILE = "camera.yaml", "color_camera.yaml"
 
 
@@ -54,7 +56,7 @@ def open_folder(
     depth, color = _images(path / "depth", DEPTH_SUFFIXES), _images(path / "color", COLOR_SUFFIXES)
     infrared = _images(path / "infrared", INFRARED_SUFFIXES)
     if not depth:
-        raise DatasetError(f"{path / 'depth'}: no *.png (16 bits) or *.npy (metres) here")
+        raise DatasetError(f"{path / 'depth'}: no *.png (16 bits) or *.npy here")
     stems = in_order({*depth, *color})
     poses = _read_poses(_pose_source(path, settings), stems, max_difference)
     frames = [
@@ -70,11 +72,13 @@ def open_folder(
     source = str(path / CAMERA_FILE) if camera is None else "camera"
     own = path / COLOR_CAMERA_FILE
     camera = check_size(camera or settings.camera(source), depth_size(frames), source)
+    given = settings.depth_scale if depth_scale is None else depth_scale
     return Recording(
         f"folder {path}",
         frames,
         camera,
-        settings.depth_scale if depth_scale is None else depth_scale,
+        DEPTH_SCALE if given is None else given,
+        float_scale=1.0 if given is None else given,
         invalid=settings.depth_invalid,
         fit_color=True,
         drop_alpha=drop_alpha,

@@ -25,8 +25,8 @@ HEADER_BYTES = 4096  # the size in a PNG or PGM header stands within these
 
 
 def read_color(path: Path, *, drop_alpha: bool = False) -> NDArray[np.uint8]:
-    """The 8-bit colour image at `path` as (H, W, 3) RGB; an alpha channel is an error unless
-    `drop_alpha`.
+    """The 8-bit colour image at `path` as (H, W, 3) RGB, grey as R = G = B; an alpha channel is an
+    error unless `drop_alpha`.
     """
     return decode_color(_read_bytes(path), str(path), drop_alpha=drop_alpha)
 
@@ -35,6 +35,8 @@ def decode_color(data: bytes, where: str, *, drop_alpha: bool = False) -> NDArra
     """The bytes of a PNG or JPEG file as (H, W, 3) RGB; `where` names them in messages."""
     image = decode_image(data, where, _check_color_header)
     channels = 1 if image.ndim == 2 else image.shape[2]
+    if channels == 1:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), np.uint8)
     if channels == 4 and drop_alpha:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGB), np.uint8)
     if channels != 3:
@@ -50,12 +52,14 @@ def read_depth(
     depth_scale: float,
     invalid: Collection[int] = INVALID_DEPTH,
     size: tuple[int, int] | None = None,
+    *,
+    float_scale: float = 1.0,
 ) -> NDArray[np.float32]:
     """The depth image at `path` as (H, W) metres, 0 where there is no reading.
 
     PNG and PGM hold 16-bit integers, `depth_scale` units a metre, `invalid` among them. NPY holds
-    such integers, or floats, which are metres already. With the `size` (width, height) of the camera,
-    an image of another is a SizeMismatch before it is decoded.
+    integers of any size, the same units, or floats, `float_scale` of them a metre. With the `size`
+    (width, height) of the camera, an image of another is a SizeMismatch before it is decoded.
     """
     if size is not None and (found := depth_file_size(path)) != size:
         raise SizeMismatch(
@@ -64,11 +68,36 @@ def read_depth(
     if path.suffix.lower() != ".npy":
         image = decode_image(_read_bytes(path), str(path), _check_depth_header)
         return depth_to_metres(image, str(path), depth_scale, invalid)
-    array = np.array(_open_npy(path))
-    if array.ndim == 2 and np.issubdtype(array.dtype, np.floating):
-        depth = array.astype(np.float32)
-        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-    return depth_to_metres(array, str(path), depth_scale, invalid)
+    array = _one_plane(_open_npy(path), path)
+    scale = float_scale if array.dtype.kind == "f" else depth_scale
+    depth = np.array(array, np.float64 if array.dtype.itemsize > 2 else np.float32)
+    bad = ~(np.isfinite(depth) & (depth > 0))
+    for value in invalid:
+        bad |= depth == value
+    with np.errstate(over="ignore"):
+        depth = (depth / scale).astype(np.float32)
+    depth[bad | ~np.isfinite(depth)] = 0
+    return depth
+
+
+def holds_floats(path: Path) -> bool:
+    """Whether the depth image at `path` is an array of floats, which are metres unless a scale is
+    given; FrameError where it cannot be read.
+    """
+    return path.suffix.lower() == ".npy" and _open_npy(path).dtype.kind == "f"
+
+
+def _one_plane(array: NDArray, path: Path) -> NDArray:
+    """An array of depth as (H, W), also where a first or last axis of length 1 is left."""
+    shape = array.shape
+    if array.ndim == 3 and 1 in (shape[0], shape[2]):
+        array = array[..., 0] if shape[2] == 1 else array[0]
+    if array.ndim != 2 or array.dtype.kind not in "fiu" or array.dtype.itemsize < 2:
+        raise FrameError(
+            f"{path}: depth must be (H, W) numbers of 16 bits or more, got {shape} {array.dtype}; "
+            "an 8-bit or coloured picture of depth holds no distances"
+        )
+    return array
 
 
 def read_scaled_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
@@ -157,9 +186,7 @@ def read_values(path: Path) -> NDArray[np.float32]:
 def depth_file_size(path: Path) -> tuple[int, int]:
     """(width, height) of the depth image at `path`, from its header alone."""
     if path.suffix.lower() == ".npy":
-        array = _open_npy(path)
-        if array.ndim != 2:
-            raise FrameError(f"{path}: depth must be (H, W), got shape {array.shape}")
+        array = _one_plane(_open_npy(path), path)
         return array.shape[1], array.shape[0]
     header = read_header(_read_bytes(path, HEADER_BYTES), str(path))
     return header.width, header.height

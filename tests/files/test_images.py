@@ -79,7 +79,6 @@ def test_F5_folder_resizes_the_same_shape_only(tmp_path):
 @pytest.mark.parametrize(
     "image, said",
     [
-        (np.zeros((12, 16), np.uint8), "3 channels, got 1"),
         (np.zeros((12, 16, 4), np.uint8), "drop_alpha"),
         (np.zeros((12, 16, 3), np.uint16), "8 bits a channel, got uint16"),
         (np.zeros((12, 16), np.uint16), "is this a depth image"),
@@ -91,6 +90,15 @@ def test_F6_colour_of_another_kind_is_refused(scene, image, said):
     with pytest.raises(FrameError, match=said) as caught:
         open_dataset("7scenes", scene)[1]
     assert str(file) in str(caught.value)
+
+
+def test_K_grey_colour_is_r_equal_to_g_equal_to_b(scene):
+    grey = make_samples(2)[1].color[..., 0]
+    (scene / "frame-000001.color.png").write_bytes(encoded(".png", grey))
+    color = open_dataset("7scenes", scene)[1].color
+    np.testing.assert_array_equal(color, np.repeat(grey[..., None], 3, axis=2))
+    (scene / "frame-000001.color.png").write_bytes(encoded(".jpg", np.full_like(grey, 90)))
+    assert (open_dataset("7scenes", scene)[1].color == 90).all()
 
 
 def test_F6_alpha_is_dropped_by_option(scene):
@@ -207,7 +215,8 @@ def test_F9_a_plausible_scale_is_left_alone():
     assert guess_depth_scale(np.full((4, 4), 2.0, np.float32), 1000.0) is None
     assert guess_depth_scale(np.full((4, 4), 0.4, np.float32), 5000.0) is None
     assert guess_depth_scale(np.zeros((4, 4), np.float32), 1000.0) is None
-    assert "look up" in guess_depth_scale(np.full((4, 4), 1e9, np.float32), 1000.0)
+    far = np.linspace(1e8, 1e9, 64, dtype=np.float32).reshape(8, 8)
+    assert "look up" in guess_depth_scale(far, 1000.0)
 
 
 @pytest.mark.parametrize("scale", [0, -1000.0, float("nan"), float("inf"), "1000"])
@@ -305,7 +314,7 @@ def test_npy_depth_of_every_usual_type(tmp_path):
         read_depth(tmp_path / "depth.npy", 1000.0), np.array([[1.5, 0]], np.float32)
     )
     assert depth_file_size(tmp_path / "depth.npy") == (2, 1)
-    np.save(tmp_path / "depth.npy", np.array([[1500, 7]], np.int64))
+    np.save(tmp_path / "depth.npy", np.array([[150, 7]], np.uint8))
     with pytest.raises(FrameError, match="16 bits"):
         read_depth(tmp_path / "depth.npy", 1000.0)
 
@@ -355,3 +364,14 @@ def test_c15_a_zero_byte_in_a_name_is_a_sentence(tmp_path):
     ):
         with pytest.raises(FileError, match="zero byte"):
             use(str(tmp_path / "a\0b"))
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", ">f4", "f8", "i2", "u2", "i4", "u4", "i8"])
+@pytest.mark.parametrize("shape", [(2, 3), (2, 3, 1), (1, 2, 3)])
+def test_D_a_given_scale_holds_for_arrays_of_every_number_type(tmp_path, dtype, shape):
+    file, metres = tmp_path / "depth.npy", [[1.5, 0.0, 0.25], [2.0, 0.5, 1.0]]
+    np.save(file, (1000 * np.array(metres)).astype(dtype).reshape(shape))
+    np.testing.assert_array_equal(
+        read_depth(file, 1000.0, float_scale=1000.0), np.array(metres, np.float32)
+    )
+    assert depth_file_size(file) == (3, 2)
