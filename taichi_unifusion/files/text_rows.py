@@ -9,6 +9,8 @@ from pathlib import Path
 
 from ..errors import DatasetError
 
+LONGEST_STAMP = 1e25
+
 
 def read_lines(path: Path) -> Iterator[tuple[int, str]]:
     """`parse_lines` of a file; whatever is wrong with it is a DatasetError."""
@@ -49,6 +51,12 @@ def parse_numbers(words: Sequence[str], where: str) -> list[float]:
         return [float(word) for word in words]
     except ValueError as error:
         raise DatasetError(f"{where}: {str(error).rpartition(': ')[2]} is not a number") from None
+
+
+def is_stamp(word: str) -> bool:
+    """Whether the word is a number that may be a time stamp, in whatever unit."""
+    value = finite_or_none(word)
+    return value is not None and abs(value) < LONGEST_STAMP
 
 
 def finite_or_none(word: str) -> float | None:

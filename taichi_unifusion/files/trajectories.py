@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from ..errors import DatasetError, PoseError
 from ..geometry.quaternions import quaternion_to_rotation, rotation_to_quaternion
+from ..geometry.time_stamps import SECONDS, to_nanoseconds, unit_of
 from ..types import Trajectory, check_rigid
 from .atomic import atomic_write, read_bytes
-from .text_rows import finite_or_none, parse_lines, parse_numbers, read_lines, split_row
+from .text_rows import finite_or_none, is_stamp, parse_lines, parse_numbers, read_lines, split_row
 
 # of a quaternion's length: four printed digits pass, a wrong column does not
 UNIT_TOLERANCE = 1e-3
@@ -78,10 +79,16 @@ class PoseRow:
 
 @dataclass(frozen=True)
 class StampedPose:
-    """A pose and its time stamp [s]."""
+    """A pose and its time stamp."""
 
-    timestamp: float
+    nanoseconds: int
     pose: Pose
+    unit: str = SECONDS  # that the file has its stamps in
+
+    @property
+    def timestamp(self) -> float:
+        """The time stamp [s]."""
+        return self.nanoseconds / 10**9
 
 
 def read_pose_rows(path: Path, columns: Collection[int] = tuple(ROWS)) -> list[PoseRow]:
@@ -99,14 +106,14 @@ def read_stamped_poses(path: Path) -> list[StampedPose]:
 
 
 def stamped(rows: Sequence[PoseRow]) -> list[StampedPose]:
-    """The rows with their time stamps, or DatasetError for the first that has none."""
-    poses = []
+    """The rows with their time stamps, whatever their unit; DatasetError for the first that has
+    none.
+    """
     for row in rows:
-        timestamp = row.timestamp
-        if timestamp is None:
+        if not is_stamp(row.name):
             raise DatasetError(f"{row.pose.source}: '{row.name}' is not a time stamp")
-        poses.append(StampedPose(timestamp, row.pose))
-    return poses
+    unit = unit_of([row.name for row in rows])
+    return [StampedPose(to_nanoseconds(row.name, unit), row.pose, unit) for row in rows]
 
 
 def read_pose_file(path: Path) -> Pose:
@@ -131,7 +138,7 @@ def read_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     """
     lines = list(parse_lines(read_bytes(path), str(path)))
     rows = stamped(_parse_pose_rows(lines, str(path), (TUM,)))
-    rows.sort(key=lambda row: row.timestamp)
+    rows.sort(key=lambda row: row.nanoseconds)
     return Trajectory(
         np.array([row.timestamp for row in rows]), np.array([row.pose.checked() for row in rows])
     )

@@ -59,6 +59,7 @@ class ExternalPoseTracker(Tracker):
         check_max_difference(max_difference)
         self.poses, self.interpolate, self.max_difference = poses, interpolate, max_difference
         self.warnings = poses.warnings
+        self.numbered = bool((poses.keys == np.rint(poses.keys)).all())
         self.frames: list[TrackedFrame] = []
         self.keys: list[float] = []  # number or time stamp of every frame
 
@@ -74,6 +75,11 @@ class ExternalPoseTracker(Tracker):
         poses = self.poses
         key, unit, tolerance, longest = self._key(frame)
         self.keys.append(key)
+        if unit == "frames" and poses.by_time and not self.numbered:
+            message = (
+                f"{poses.source}: its time stamps are no frame numbers, and the frame has no time"
+            )
+            return Verdict.MISSING, None, message
         at = int(nearest(poses.keys, np.array([key]))[0])
         gap = abs(poses.keys[at] - key)
         if gap <= tolerance:

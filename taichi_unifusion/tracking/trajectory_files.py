@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..datasets.pose_rows import say_unit
 from ..errors import DatasetError, PoseError
 from ..files.frame_files import list_names, number_of
 from ..files.trajectories import Pose, read_pose_file, read_pose_rows, stamped
@@ -49,7 +50,11 @@ def read_poses(path: str | Path) -> ExternalPoses:
         return replace(poses, by_name=True)
     rows = read_pose_rows(path)
     if rows[0].name:
-        return _checked(path, True, [(row.timestamp, row.pose) for row in stamped(rows)])
+        timed = stamped(rows)
+        poses = _checked(path, True, [(row.timestamp, row.pose) for row in timed])
+        warnings: list[str] = []
+        say_unit(path, timed[0].unit, warnings)
+        return replace(poses, warnings=(*warnings, *poses.warnings))
     return _checked(path, False, [(number, row.pose) for number, row in enumerate(rows)])
 
 
