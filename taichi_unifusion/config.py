@@ -147,7 +147,14 @@ def load_config(path: str | Path, base: Config | None = None) -> Config:
         values = read_yaml(path)
     except InputError as error:
         raise ConfigError(str(error)) from None
-    return _overlay(base or Config(), values, str(path), "")
+    return config_of(values, str(path), base)
+
+
+def config_of(values: Any, source: str, base: Config | None = None) -> Config:
+    """`base` (the defaults) with the mapping `values` over it; errors, which name their `source`, as
+    in `load_config`.
+    """
+    return _overlay(base or Config(), values, source, "")
 
 
 def dump_config(config: Config) -> str:

@@ -21,7 +21,8 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from ..config import Config, load_config
+from ..config import Config, config_of, load_config
+from ..datasets.doctor.fix import read_fix
 from ..errors import FileError, UniFusionError, as_known, check_choice
 from .config import ShowConfig, show_config
 from .convert import Convert, convert
@@ -148,8 +149,13 @@ def _parse(prog: str, options: type, arguments: list[str]) -> Any:
     arguments = with_long_names(arguments)
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     finder.add_argument("--config", nargs="?")
-    file = finder.parse_known_args(arguments)[0].config
-    settings = load_config(file) if file else Config()
+    finder.add_argument("--fix", nargs="?")
+    files = finder.parse_known_args(arguments)[0]
+    settings = Config()
+    if files.fix:
+        settings = config_of(read_fix(files.fix).settings, files.fix, settings)
+    if files.config:
+        settings = load_config(files.config, settings)
     required = {
         field.name: tyro.MISSING_NONPROP
         for field in dataclasses.fields(options)

@@ -23,6 +23,7 @@ from ..datasets import (
     open_dataset,
     parse_options,
 )
+from ..datasets.doctor.fix import read_fix
 from ..errors import DatasetError, InputError
 from ..results.record import ColorRecord, Source
 from ..tracking import Mode
@@ -91,6 +92,24 @@ class RecordingOptions:
         Path | None, arg(metavar="FILE", help_behavior_hint="(scene needs one)")
     ] = None
     """Poses to render a scene from: lines 'timestamp tx ty tz qx qy qz qw', camera to world."""
+    intrinsics: Annotated[
+        str | None, arg(metavar="FX,FY,CX,CY", help_behavior_hint="(default: the recording's)")
+    ] = None
+    """Intrinsics of the depth images, in pixels."""
+    pose_reading: Annotated[
+        str | None, arg(metavar="WORDS", help_behavior_hint="(default: c2w)")
+    ] = None
+    """How the recording's poses are written, as w2c, opengl or w-first+w2c; a wrong one lists the words."""
+    pose_scale: Annotated[
+        float | None, arg(metavar="METRES", help_behavior_hint="(default: 1)")
+    ] = None
+    """Metres in a unit of the poses' translations: 0.01 where they are centimetres."""
+    clock_offset: Annotated[
+        float | None, arg(metavar="SECONDS", help_behavior_hint="(default: 0)")
+    ] = None
+    """Seconds to add to a frame's time stamp before its pose is looked up."""
+    fix: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
+    """What `unifusion check --fix FILE` wrote for this recording; options given here count more."""
     color_camera: ColorChoice = AUTO
     """Where the colour camera stands. auto: found from the frames, and used if colour then fits depth better in
     frames left out; FILE: your calibration; kinect: a Kinect's nominal one; none: colour as recorded.
@@ -219,8 +238,14 @@ def reading_options(options: RecordingOptions) -> dict[str, Any]:
         "max_difference": options.max_difference,
         "drop_alpha": options.drop_alpha or None,
         "trajectory": options.camera_path,
+        "intrinsics": options.intrinsics,
+        "pose_reading": options.pose_reading,
+        "pose_scale": options.pose_scale,
+        "clock_offset": options.clock_offset,
     }
     given = {name: value for name, value in flags.items() if value is not None}
+    if options.fix is not None:
+        given = {**read_fix(options.fix).recording, **given}
     if options.camera_path is not None and "trajectory" not in format_options(options.kind):
         raise InputError(f"--camera-path: format '{options.kind}' has poses of its own; drop it")
     return merged_options(options.kind, given, options.option)

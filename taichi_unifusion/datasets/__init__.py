@@ -9,7 +9,7 @@ import inspect
 import logging
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
@@ -18,6 +18,8 @@ import lazy_loader
 
 from ..errors import DatasetError, InputError, convert, did_you_mean, is_convertible
 from .dataset import Dataset, DatasetView
+from .depth_camera import Intrinsics
+from .mending import MENDINGS, Mended, Mending
 
 if TYPE_CHECKING:
     from .color_camera import ColorCamera
@@ -72,7 +74,10 @@ SENTENCES = {  # what an option of open_dataset means, the same in every format 
     "weigh_confidence": "Readings of confidence 1 count half as much as those of 2.",
     "width": "Columns of an image.",
     "world_frame": "Frame of the transforms that is the world, as odom; the root of their tree is.",
+    **MENDINGS,
 }
+# formats whose `camera` may be bare intrinsics; in others it is put into the frames as they are read
+TAKES_INTRINSICS = ("7scenes", "replica", "tum", "scannet", "folder")
 
 __all__ = [
     "FORMATS",
@@ -123,6 +128,18 @@ def open_dataset(format: str, path: str | Path | None = None, **options: Any) ->
     known = format_options(format)
     for option in options:
         _check_option(option, format, known)
+    mending = Mending.of(options)
+    options = {name: value for name, value in options.items() if name not in MENDINGS}
+    if mending.intrinsics is not None and format in TAKES_INTRINSICS:
+        options["camera"] = Intrinsics(*mending.intrinsics)
+        mending = replace(mending, intrinsics=None)
+    recording = _open(format, opener, path, options)
+    return Mended(recording, mending) if mending.changes else recording
+
+
+def _open(
+    format: str, opener: Callable[..., Dataset], path: str | Path | None, options: dict[str, Any]
+) -> Dataset:
     if path is None:
         if inspect.signature(opener).parameters["path"].default is inspect.Parameter.empty:
             raise DatasetError(f"format '{format}' needs the path of a recording")
@@ -166,10 +183,14 @@ def format_options(format: str) -> dict[str, FormatOption]:
     """
     opener = _opener(format)
     types = get_type_hints(opener.__init__ if inspect.isclass(opener) else opener)
-    return {
+    own = {
         name: FormatOption(name, types[name], parameter.default, SENTENCES[name])
         for name, parameter in inspect.signature(opener).parameters.items()
         if name != "path"
+    }
+    mending = get_type_hints(Mending)
+    return own | {
+        name: FormatOption(name, mending[name], None, MENDINGS[name]) for name in MENDINGS
     }
 
 
@@ -190,6 +211,9 @@ def parse_options(format: str, texts: Iterable[str]) -> dict[str, Any]:
             raise InputError(f"option '{name}' is given twice")
         if not known[name].has_text_form:
             raise InputError(f"option '{name}' cannot be given as text, only in Python")
+        if name in MENDINGS:
+            options[name] = getattr(Mending.of({name: value}), name)
+            continue
         options[name] = convert(value, known[name].type, f"option '{name}'")
     return options
 

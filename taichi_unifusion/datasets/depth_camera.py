@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import DatasetError, InputError
 from ..files.text_rows import parse_numbers, read_lines, split_row
 from ..types import PinholeCamera
+
+
+class Intrinsics(NamedTuple):
+    """fx fy cx cy [pixels] of depth images, whatever size these have."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
 
 
 def make_camera(
@@ -35,11 +45,17 @@ def read_matrix_camera(path: Path, size: tuple[int, int]) -> PinholeCamera:
     return make_camera(str(path), size, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
-def check_size(camera: PinholeCamera, size: tuple[int, int], source: str) -> PinholeCamera:
-    """The camera, if it is for depth images of `size` (width, height); else DatasetError."""
+def check_size(
+    camera: PinholeCamera | Intrinsics, size: tuple[int, int], source: str
+) -> PinholeCamera:
+    """The camera, if it is for depth images of `size` (width, height), as bare intrinsics are; else
+    DatasetError.
+    """
+    if isinstance(camera, Intrinsics):
+        return make_camera("intrinsics", size, *camera)
     if camera.size != size:
         raise DatasetError(
             f"{source}: the intrinsics are for {camera.width}x{camera.height} images but the depth images are "
-            f"{size[0]}x{size[1]}; pass the depth camera's own as camera=PinholeCamera(...)"
+            f"{size[0]}x{size[1]}; give the depth camera's own: --intrinsics, or in Python camera=PinholeCamera(...)"
         )
     return camera

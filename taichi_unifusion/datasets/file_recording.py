@@ -53,8 +53,9 @@ class Recording(CameraPair):
     """Frames read from files when indexed.
 
     `depth_scale` is in units a metre, `float_scale` the same for arrays of floats, `invalid` the
-    units that mean no reading, `fit_color` resamples colour of another size, `no_poses` says what is missing where no frame has a pose.
-    `color_camera` is the colour camera's own, where colour is not registered to depth yet.
+    units that mean no reading, `fit_color` resamples colour of another size, `no_poses` says what
+    is missing where no frame has a pose. `color_camera` is the colour camera's own, where colour is
+    not registered to depth yet.
     """
 
     def __init__(

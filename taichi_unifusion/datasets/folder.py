@@ -8,8 +8,9 @@ depth, where another size of the same shape is resampled, or, beside a `color_ca
 camera took it. Frames are the names, in the order of the numbers in them. Infrared, if any:
 `infrared/NAME.png`, one channel of 8 or 16 bits, registered to depth, for the frames that have one.
 Poses: camera-to-world in metres, camera x right, y down, z forward, as `poses/NAME.txt` (4x4 each),
-or `poses.txt` with rows `NAME tx ty tz qx qy qz qw` (a name that is a number may be a time stamp,
-matched within max_difference), or `poses.txt` with one row of 16 numbers for every frame, in their order.
+or `poses.txt` with rows `NAME tx ty tz qx qy qz qw` (where images are named by time it may be a
+time stamp, matched within max_difference; `pose_rows.py` has the rules), or `poses.txt` with one row
+of 16 numbers for every frame, in their order.
 """
 
 from __future__ import annotations
@@ -18,19 +19,16 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..errors import DatasetError
 from ..files.frame_files import files_by_stem, in_order, list_names
-from ..files.text_rows import finite_or_none
-from ..files.trajectories import REPLICA, TUM, Pose, PoseRow, read_pose_file, read_pose_rows
-from ..geometry.time_stamps import check_max_difference, nearest
+from ..files.trajectories import REPLICA, TUM, Pose, read_pose_file, read_pose_rows
+from ..geometry.time_stamps import check_max_difference, unit_of
 from ..types import PinholeCamera
 from .camera_yaml import CameraFile, read_camera_yaml
 from .color_camera import read_color_camera
-from .depth_camera import check_size
+from .depth_camera import Intrinsics, check_size
 from .file_recording import FrameFiles, Recording, depth_size
+from .pose_rows import rows_of_frames, say_unit, times_of
 
 DEPTH_SUFFIXES, COLOR_SUFFIXES, INFRARED_SUFFIXES = (
     (".png", ".npy"),
@@ -46,7 +44,7 @@ def open_folder(
     path: Path,
     *,
     depth_scale: float | None = None,
-    camera: PinholeCamera | None = None,
+    camera: PinholeCamera | Intrinsics | None = None,
     drop_alpha: bool = False,
     max_difference: float = MAX_DIFFERENCE,
 ) -> Recording:
@@ -58,16 +56,20 @@ def open_folder(
     if not depth:
         raise DatasetError(f"{path / 'depth'}: no *.png (16 bits) or *.npy here")
     stems = in_order({*depth, *color})
-    poses = _read_poses(_pose_source(path, settings), stems, max_difference)
+    warnings: list[str] = []
+    poses = _read_poses(_pose_source(path, settings), stems, max_difference, warnings)
+    times = times_of(stems)
+    if times:
+        say_unit(path / "depth", unit_of(stems), warnings)
     frames = [
         FrameFiles(
             _file_of(stem, depth),
             _file_of(stem, color) if color else None,
             pose,
-            finite_or_none(stem) if "." in stem else None,
+            times[i] / 10**9 if times else None,
             infrared.get(stem),
         )
-        for stem, pose in zip(stems, poses, strict=True)
+        for i, (stem, pose) in enumerate(zip(stems, poses, strict=True))
     ]
     source = str(path / CAMERA_FILE) if camera is None else "camera"
     own = path / COLOR_CAMERA_FILE
@@ -82,16 +84,18 @@ def open_folder(
         invalid=settings.depth_invalid,
         fit_color=True,
         drop_alpha=drop_alpha,
+        warnings=warnings,
         no_poses="" if any(poses) else f"{path}: no poses.txt and no poses/ here",
         color_camera=read_color_camera(own) if own.exists() else None,
     )
 
 
-def _settings(path: Path, camera: PinholeCamera | None) -> CameraFile:
+def _settings(path: Path, camera: PinholeCamera | Intrinsics | None) -> CameraFile:
     """camera.yaml; a caller's camera may stand in for it, but a file that is there must be right."""
     file = path / CAMERA_FILE
     if camera is not None and not file.exists():
-        return CameraFile(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        size = camera.size if isinstance(camera, PinholeCamera) else (1, 1)
+        return CameraFile(*size, camera.fx, camera.fy, camera.cx, camera.cy)
     list_names(path)  # says so if this is no folder
     return read_camera_yaml(file)
 
@@ -119,7 +123,7 @@ def _pose_source(path: Path, settings: CameraFile) -> Path | None:
 
 
 def _read_poses(
-    source: Path | None, stems: Sequence[str], max_difference: float
+    source: Path | None, stems: Sequence[str], max_difference: float, warnings: list[str]
 ) -> list[Pose | None]:
     """The pose of every frame, in the order of `stems`; all None where no poses are given."""
     if source is None:
@@ -128,51 +132,12 @@ def _read_poses(
         return [read_pose_file(source / f"{stem}.txt") for stem in stems]
     rows = read_pose_rows(source, (TUM, REPLICA))
     if rows[0].name:
-        return [*_named_poses(rows, source, stems, max_difference)]
+        named = rows_of_frames(rows, source, stems, max_difference)
+        warnings += named.warnings
+        return [*named.poses]
     if len(rows) != len(stems):
         raise DatasetError(
             f"{source}: {len(rows)} rows for {len(stems)} frames; rows of 16 numbers bear no names, so every "
             "frame needs one; else write rows of 'name tx ty tz qx qy qz qw'"
         )
     return [row.pose for row in rows]
-
-
-def _named_poses(
-    rows: Sequence[PoseRow], source: Path, stems: Sequence[str], max_difference: float
-) -> list[Pose]:
-    """For every stem the row of that name, else the row nearest in time if the stem is a number."""
-    by_name: dict[str, PoseRow] = {}
-    for row in rows:
-        if by_name.setdefault(row.name, row) is not row:
-            raise DatasetError(
-                f"{row.pose.source}: '{row.name}' appears again (first: {by_name[row.name].pose.source}), keep one"
-            )
-    times, timed = _timed(rows)
-
-    def find(stem: str) -> PoseRow | None:
-        time = finite_or_none(stem)
-        if stem in by_name or time is None or not timed:
-            return by_name.get(stem)
-        at = int(nearest(times, np.array([time]))[0])
-        return timed[at] if abs(times[at] - time) <= max_difference else None
-
-    found = [find(stem) for stem in stems]
-    if not any(found):
-        raise DatasetError(
-            f"{source}: no row belongs to a frame; the first column must be a frame's name like '{stems[0]}', "
-            f"but is '{rows[0].name}'"
-        )
-    nothing = (
-        f"no row for it (its name in the first column, or a time stamp within {max_difference} s)"
-    )
-    return [
-        row.pose if row else Pose(f"{source} frame {stem}", problem=nothing)
-        for stem, row in zip(stems, found, strict=True)
-    ]
-
-
-def _timed(rows: Sequence[PoseRow]) -> tuple[NDArray[np.float64], list[PoseRow]]:
-    """Time stamps [s], ascending, and the rows that have one."""
-    pairs = [(row.timestamp, row) for row in rows if row.timestamp is not None]
-    pairs.sort(key=lambda pair: pair[0])
-    return np.array([time for time, _ in pairs]), [row for _, row in pairs]

@@ -19,7 +19,7 @@ from ..files.frame_files import file_of, first_existing, numbered_files
 from ..files.json_text import parse_json
 from ..files.trajectories import REPLICA, Pose, read_pose_rows
 from ..types import PinholeCamera
-from .depth_camera import check_size, make_camera
+from .depth_camera import Intrinsics, check_size, make_camera
 from .file_recording import FrameFiles, Recording, check_depth_scale, depth_size
 
 DEPTH_SCALE = 6553.5
@@ -30,7 +30,7 @@ def open_replica(
     path: Path,
     *,
     depth_scale: float | None = None,
-    camera: PinholeCamera | None = None,
+    camera: PinholeCamera | Intrinsics | None = None,
     drop_alpha: bool = False,
 ) -> Recording:
     """The scene in folder `path`, which holds traj.txt (or is the results folder beside it)."""

@@ -19,7 +19,7 @@ from ..files.frame_files import file_of, first_existing, list_names, numbered_fi
 from ..files.text_rows import parse_numbers, read_lines
 from ..files.trajectories import read_pose_file
 from ..types import PinholeCamera
-from .depth_camera import check_size, make_camera, read_matrix_camera
+from .depth_camera import Intrinsics, check_size, make_camera, read_matrix_camera
 from .file_recording import FrameFiles, Recording, check_depth_scale, depth_size
 from .sens import SensFile
 from .seven_scenes import flat_frames, no_flat_poses
@@ -34,7 +34,7 @@ def open_scannet(
     path: Path,
     *,
     depth_scale: float | None = None,
-    camera: PinholeCamera | None = None,
+    camera: PinholeCamera | Intrinsics | None = None,
     drop_alpha: bool = False,
 ) -> Recording | SensFile:
     """The scan at `path`: a .sens file, a folder with exactly one, or a folder of extracted frames."""
@@ -57,7 +57,10 @@ def open_scannet(
 
 
 def _open_extracted(
-    path: Path, depth_scale: float | None, camera: PinholeCamera | None, drop_alpha: bool
+    path: Path,
+    depth_scale: float | None,
+    camera: PinholeCamera | Intrinsics | None,
+    drop_alpha: bool,
 ) -> Recording:
     depth = numbered_files(path / "depth", r"(\d+)\.png")
     color = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
@@ -96,7 +99,10 @@ def _open_extracted(
 
 
 def _open_flat(
-    path: Path, depth_scale: float | None, camera: PinholeCamera | None, drop_alpha: bool
+    path: Path,
+    depth_scale: float | None,
+    camera: PinholeCamera | Intrinsics | None,
+    drop_alpha: bool,
 ) -> Recording:
     frames = flat_frames(path, depth_suffix="pgm|png")
     if not frames:

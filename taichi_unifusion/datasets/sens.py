@@ -16,7 +16,7 @@ from ..files.sens_container import decode_sens_color, decode_sens_depth, open_se
 from ..files.trajectories import Pose
 from ..types import Frame, PinholeCamera
 from .camera_pair import CameraPair
-from .depth_camera import check_size, make_camera
+from .depth_camera import Intrinsics, check_size, make_camera
 from .file_recording import check_depth_scale
 from .plausibility import camera_warnings, pose_warnings
 
@@ -29,7 +29,7 @@ class SensFile(CameraPair):
         path: Path,
         *,
         depth_scale: float | None = None,
-        camera: PinholeCamera | None = None,
+        camera: PinholeCamera | Intrinsics | None = None,
         drop_alpha: bool = False,
     ) -> None:
         self.name, self.path, self.drop_alpha = f"scannet {path}", path, drop_alpha

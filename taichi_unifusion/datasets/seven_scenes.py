@@ -16,7 +16,7 @@ from ..errors import DatasetError
 from ..files.frame_files import file_of, first_existing, list_names, numbered_files
 from ..files.trajectories import read_pose_file
 from ..types import PinholeCamera
-from .depth_camera import check_size, make_camera, read_matrix_camera
+from .depth_camera import Intrinsics, check_size, make_camera, read_matrix_camera
 from .file_recording import FrameFiles, Recording, depth_size
 
 DEPTH_SCALE = 1000.0
@@ -28,7 +28,7 @@ def open_seven_scenes(
     path: Path,
     *,
     depth_scale: float | None = None,
-    camera: PinholeCamera | None = None,
+    camera: PinholeCamera | Intrinsics | None = None,
     drop_alpha: bool = False,
 ) -> Recording:
     """The sequence in folder `path`; frames are the numbers for which any of the three files
@@ -89,7 +89,7 @@ def _only_sequence(path: Path) -> Path:
 
 
 def _camera(
-    folder: Path, frames: Sequence[FrameFiles], camera: PinholeCamera | None
+    folder: Path, frames: Sequence[FrameFiles], camera: PinholeCamera | Intrinsics | None
 ) -> PinholeCamera:
     size = depth_size(frames)
     if camera is not None:
