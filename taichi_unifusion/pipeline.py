@@ -31,7 +31,7 @@ from .maps.tiled_mesh import joined_mesh
 from .maps.window import WindowFusion
 from .maps.working_set import make_memory
 from .networks.encoders import ImageEncoder
-from .preprocessing import PreprocessSettings, find_patches, invert_depth, preprocess
+from .preprocessing import FARTHEST, PreprocessSettings, find_patches, invert_depth, preprocess
 from .properties import SurfaceProperty, make_property
 from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, SkippedFrame, StepResult
 from .types import Frame, Mesh, PinholeCamera
@@ -416,9 +416,11 @@ class StageClock:
 
 
 def _why_empty(frame: Frame, settings: PreprocessSettings) -> str:
-    readings = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
+    positive = np.isfinite(frame.depth) & (frame.depth > 0)
+    readings = frame.depth[positive & (frame.depth <= FARTHEST)]
     if not len(readings):
-        return "the depth image holds no reading at all"
+        beyond = f" up to {FARTHEST:g} m" if positive.any() else ""
+        return f"the depth image holds no reading at all{beyond}"
     if not ((readings >= settings.depth_min) & (readings <= settings.depth_max)).any():
         return (
             f"all depth readings lie outside {settings.depth_min:g}..{settings.depth_max:g} m "

@@ -10,9 +10,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from .datasets.file_recording import Recording
 from .datasets.loading import index_in_recording, recording_of
-from .datasets.plausibility import guess_depth_scale
-from .datasets.pose_convention import guess_pose_convention, has_moved
+from .datasets.plausibility import guess_depth_scale, is_reading
+from .datasets.pose_convention import judge_poses
+from .datasets.pose_fit import EarlyPairs
 from .errors import DatasetError, FrameError, OutOfRange, PoseError, SizeMismatch, UniFusionError
 from .maps import Integration
 from .preprocessing import FARTHEST, PreprocessSettings
@@ -22,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 MOST_OUTSIDE = 0.05  # of the readings may lie outside depth_min..depth_max unsaid
 SPARSE = 4  # one pixel of so many each way stands for all
-POSE_PAIRS = 5  # pairs of frames to try before giving up on checking the pose convention
+
 
 
 class EmptyFrame(FrameError):
@@ -71,6 +73,8 @@ class RunResult:
     seconds: float
     interrupted: bool = False  # asked to stop before the last frame
     failure: Exception | None = None  # what else ended the run before the last frame
+    # sentences on what makes the whole result doubtful; they are among the warnings too
+    doubts: tuple[str, ...] = ()
 
 
 class RunLog:
@@ -91,8 +95,8 @@ class RunLog:
         self.poses: list[tuple[float | None, np.ndarray]] = []  # time stamp, T_world_camera
         self.warnings: list[str] = []
         self.scale_checked = self.color_missing = False
-        self.reference: Frame | None = None  # frame that later ones are checked against
-        self.pose_pairs = POSE_PAIRS  # pairs still to try
+        self.early = EarlyPairs()  # frames whose poses are checked against their depth
+        self.doubts: list[str] = []  # said again at the end
         for sentence in getattr(sequence, "warnings", ()):
             self.warn(sentence)
 
@@ -102,12 +106,16 @@ class RunLog:
 
     def check_depth_scale(self, frame: Frame) -> None:
         """Warn if the first frame with readings looks as if the depth scale were wrong."""
-        scale = getattr(recording_of(self.sequence), "depth_scale", None)
+        recording = recording_of(self.sequence)
+        scale = getattr(recording, "depth_scale", None)
         if self.scale_checked or scale is None:
             return
-        self.scale_checked = bool((frame.depth > 0).any())
+        self.scale_checked = bool(is_reading(frame.depth).any())
+        if isinstance(recording, Recording):
+            scale = recording.scale_of(frame.index)
         if guess := guess_depth_scale(frame.depth, scale):
             self.warn(f"{frame.label}: {guess}")
+            self.doubts.append(self.warnings[-1])
 
     def count_readings(self, frame: Frame) -> None:
         """Note how many readings of a frame are too near or too far to be used."""
@@ -133,17 +141,16 @@ class RunLog:
         self.warn("; ".join(shares))
 
     def check_poses(self, frame: Frame) -> None:
-        """Warn if an early pair of frames shows that the poses follow another convention."""
-        if self.pose_pairs == 0:
-            return
-        if self.reference is None or not has_moved(self.reference, frame):
-            self.reference = self.reference or frame
-            return
-        decided, sentence = guess_pose_convention(self.reference, frame)
-        self.pose_pairs = 0 if decided else self.pose_pairs - 1
-        self.reference = frame if self.pose_pairs else None
-        if sentence:
-            self.warn(f"{frame.label}: {sentence}")
+        """Once there are enough early pairs of frames, warn if the poses do not fit their depth."""
+        self.early.add(frame)
+        if self.early.enough:
+            self._judge_poses()
+
+    def _judge_poses(self) -> None:
+        pairs = self.early.take()
+        if pairs is not None and (sentence := judge_poses(pairs).sentence):
+            self.warn(sentence)
+            self.doubts.append(sentence)
 
     def add_step(self, frame: Frame, step: StepResult, waited: float) -> None:
         if frame.color is None and not self.color_missing:
@@ -186,6 +193,7 @@ class RunLog:
             if error is not None:
                 error.__traceback__ = None  # it would hold the maps as long as the result lives
         self.check_range()
+        self._judge_poses()
         trajectory = Trajectory.of(
             [stamp for stamp, _ in self.poses],
             [step.index for step in self.steps],
@@ -199,6 +207,7 @@ class RunLog:
             time.perf_counter() - self.started,
             interrupted,
             failure,
+            tuple(self.doubts),
         )
 
     def _nothing_used(self) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files.trajectories import Pose
+from ..preprocessing import FARTHEST
 from ..types import PinholeCamera
 
 MIN_IDENTITIES = 3  # one is normal, the first frame; this many mean that tracking failed
@@ -21,6 +22,24 @@ TYPICAL_MEDIAN = (0.3, 10.0)  # [m] median depth of indoor recordings
 COMMON_MEDIAN = 2.0  # [m] of two scales that fit, the one that gives nearly this comes first
 # units a metre: millimetres, TUM, Replica, 0.1 mm, metres
 KNOWN_SCALES = (1000.0, 5000.0, 6553.5, 10000.0, 1.0)
+# a far plane: at least this share of an image has exactly its largest value, and the next is nearer by so much
+FAR_PLANE, FAR_PLANE_GAP = 0.01, 0.67
+MIN_VALUES = 20  # different numbers, of which fewer are no measurements
+
+
+def is_reading(depth: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which pixels (H, W) hold a reading [m]: finite, positive, not beyond what maps take, and not
+    the far plane that simulators write where nothing is hit.
+    """
+    with np.errstate(invalid="ignore"):
+        held = np.isfinite(depth) & (depth > 0) & (depth <= FARTHEST)
+    if not held.any():
+        return held
+    farthest = depth[held].max()
+    below = held & (depth < farthest)
+    if not below.any() or held.sum() - below.sum() < FAR_PLANE * depth.size:
+        return held
+    return below if depth[below].max() < FAR_PLANE_GAP * farthest else held
 
 
 def pose_warnings(poses: Sequence[Pose]) -> list[str]:
@@ -75,9 +94,11 @@ def guess_depth_scale(depth: NDArray[np.float32], current_scale: float) -> str |
     """What the depth scale may really be, as a sentence, if the median depth [m] under
     `current_scale` is implausible.
     """
-    valid = depth[np.isfinite(depth) & (depth > 0)]
-    if not len(valid):
-        return None
+    valid = depth[is_reading(depth)]
+    if not len(valid):  # all beyond what maps take: still measurements if they differ
+        valid = depth[np.isfinite(depth) & (depth > FARTHEST)]
+        if len(np.unique(valid)) < MIN_VALUES:
+            return None
     median = float(np.median(valid))
     if PLAUSIBLE_MEDIAN[0] <= median <= PLAUSIBLE_MEDIAN[1]:
         return None

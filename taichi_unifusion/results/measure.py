@@ -76,6 +76,7 @@ def measure_run(
         peak_memory_bytes=1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         files={folder.relative(file): _size(file) for file in writer.written},
         warnings=run.warnings,
+        doubts=run.doubts,
         errors=tuple(str(error) for error in failed if error is not None),
         versions=versions(),
     )

@@ -165,6 +165,7 @@ class RunRecord:
     answers: tuple[str, ...] = ()  # files of questions asked since
     earlier_files: tuple[str, ...] = ()  # of runs before, where this one could not write all
     warnings: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()  # those of the warnings that make the whole result doubtful
     errors: tuple[str, ...] = ()
     versions: Mapping[str, str]
 

@@ -60,6 +60,7 @@ def summarize(record: RunRecord, files: Sequence[str], directory: Path) -> str:
         f"memory   {format_bytes(record.peak_memory_bytes)} at most, on {record.device_name}",
         f"results  {directory}: {', '.join(files)}",
     ]
+    lines += [f"doubtful {sentence}" for sentence in record.doubts]
     return "\n".join(lines)
 
 
