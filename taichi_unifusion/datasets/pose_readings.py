@@ -18,7 +18,7 @@ from ..geometry.se3 import FLIP_YZ
 from ..geometry.quaternions import quaternion_to_rotation, rotation_to_quaternion
 
 AS_READ = "c2w"  # the reading that changes nothing
-Change = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Change = Callable[[NDArray], NDArray]
 
 FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

@@ -304,8 +304,11 @@ def _assemble(
     owner = np.repeat(
         np.arange(len(parts), dtype=np.int32), [len(mesh.faces) for _, _, mesh in parts]
     )
+    joined: dict[str, Any] = {
+        name: np.ascontiguousarray(np.concatenate(list_)) for name, list_ in arrays.items()
+    }
     return TexturedScene(
-        **{name: np.ascontiguousarray(np.concatenate(list_)) for name, list_ in arrays.items()},
+        **joined,
         face_object=owner,
         object_names=tuple(name for name, _, _ in parts),
         textures=tuple(images),
