@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, check_choice
-from ..geometry.se3 import FLIP_YZ
 from ..geometry.quaternions import quaternion_to_rotation, rotation_to_quaternion
+from ..geometry.se3 import FLIP_YZ
 
 AS_READ = "c2w"  # the reading that changes nothing
 Change = Callable[[NDArray], NDArray]
