@@ -159,7 +159,7 @@ def test_C_a_gap_that_no_option_closes_is_not_answered_with_one(tmp_path, sample
     folder = write_tum(tmp_path / "tum", samples)
     text = (folder / "rgb.txt").read_text().replace("1305031453", "1305039453")
     (folder / "rgb.txt").write_text(text)
-    with pytest.raises(DatasetError, match="colour is of .* depth is of .*recordings") as caught:
+    with pytest.raises(DatasetError, match="colour is of .* depth of .*recordings") as caught:
         open_dataset("tum", folder, camera=CAMERA)
     assert "raise max_difference" not in str(caught.value)
 
