@@ -148,6 +148,8 @@ class RunLog:
 
     def _judge_poses(self) -> None:
         pairs = self.early.take()
+        if self.doubts:  # poses in metres cannot fit a depth whose unit is wrong
+            return
         if pairs is not None and (sentence := judge_poses(pairs).sentence):
             self.warn(sentence)
             self.doubts.append(sentence)

@@ -18,8 +18,7 @@ import lazy_loader
 
 from ..errors import DatasetError, InputError, convert, did_you_mean, is_convertible
 from .dataset import Dataset, DatasetView
-from .depth_camera import Intrinsics
-from .mending import MENDINGS, Mended, Mending
+from .mending import MENDINGS, Mending
 
 if TYPE_CHECKING:
     from .color_camera import ColorCamera
@@ -130,6 +129,11 @@ def open_dataset(format: str, path: str | Path | None = None, **options: Any) ->
         _check_option(option, format, known)
     mending = Mending.of(options)
     options = {name: value for name, value in options.items() if name not in MENDINGS}
+    if not mending.changes:
+        return _open(format, opener, path, options)
+    from .depth_camera import Intrinsics
+    from .mended import Mended
+
     if mending.intrinsics is not None and format in TAKES_INTRINSICS:
         options["camera"] = Intrinsics(*mending.intrinsics)
         mending = replace(mending, intrinsics=None)
