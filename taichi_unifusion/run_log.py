@@ -26,7 +26,6 @@ MOST_OUTSIDE = 0.05  # of the readings may lie outside depth_min..depth_max unsa
 SPARSE = 4  # one pixel of so many each way stands for all
 
 
-
 class EmptyFrame(FrameError):
     """No depth reading of a frame can be used."""
 
