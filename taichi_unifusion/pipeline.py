@@ -24,12 +24,14 @@ from .kernels.patches import Patches
 from .language.source import FeatureSource
 from .maps import BaseMap, FeatureMap, Integration, PropertyMap, SurfaceMap
 from .maps.detail import Sight, sight_of
+from .maps.follower import MapFollower
 from .maps.kept_window import KeptWindow
 from .maps.property_group import group_maps
 from .maps.settings import PropertySettings
 from .maps.tiled_mesh import joined_mesh
 from .maps.window import WindowFusion
 from .maps.working_set import make_memory
+from .maps.window_store import WindowStore
 from .networks.encoders import ImageEncoder
 from .preprocessing import FARTHEST, PreprocessSettings, find_patches, invert_depth, preprocess
 from .properties import SurfaceProperty, make_property
@@ -73,9 +75,10 @@ class Pipeline:
         pipeline.extract_mesh().save("kitchen.ply")
 
     With `synchronize` off, the times of stages are those of launching them: CUDA may then overlap
-    them. `keep` is told of every window that was fused; `pipeline.fusion.take_out` undoes one. With
-    `map_memory` in the configuration, maps are kept within it; what does not fit lies in the folder
-    `tiles`, a folder a map, and `extract_mesh` goes through all of it.
+    them. `keep` is told of every window that was fused. Where it is a `WindowStore`, the maps can
+    follow a trajectory that changes: `pipeline.follower`. With `map_memory` in the configuration,
+    maps are kept within it; what does not fit lies in the folder `tiles`, a folder a map, and
+    `extract_mesh` goes through all of it.
     """
 
     def __init__(
@@ -97,6 +100,12 @@ class Pipeline:
         self.memory = make_memory(config.map_memory, tiles)
         settle = self.memory.settle if self.memory else lambda: None
         self.fusion = WindowFusion(config.window, keep, settle)
+        self.follower = MapFollower(self, keep) if isinstance(keep, WindowStore) else None
+        if self.memory and self.follower:
+            raise InputError(
+                "map_memory: a map in tiles cannot follow a trajectory that changes; leave either the "
+                "limit or the store of windows out"
+            )
         self._maps: dict[str, BaseMap] = {}
         given = config.surface.voxel_size and config.color.voxel_size and not self.sources
         if config.voxel_size or given:  # nothing is left to choose
@@ -187,14 +196,19 @@ class Pipeline:
             )
         if patches.total == 0:
             raise EmptyFrame(f"{frame.label}: {_why_empty(frame, self.config.preprocess)}")
+        done = self._integrate_alone(frame, patches, clock)
         for piece in self.fusion.due():
             with clock.stage(piece.name):
                 piece.work()
-        done = {
+        done |= {
             name: Integration(patches.pixels, voxels, len(self.maps[name].grid))
             for name, voxels in touched.items()
         }
-        done |= self._integrate_alone(frame, patches, clock)
+        if self.follower is not None:
+            self.follower.earn()
+            if self.fusion.window is None:
+                with clock.stage("follow"):
+                    self.follower.work()
         return StepResult(
             frame.index, frame.name, patches.pixels, done, clock.milliseconds, lacking
         )
@@ -207,7 +221,11 @@ class Pipeline:
         for name, each in self.maps.items():
             if isinstance(each, FeatureMap) and each.wants(frame):
                 with clock.stage(name):
-                    done[name] = each.integrate_patches(patches)
+                    if self.fusion.keep is None:
+                        done[name] = each.integrate_patches(patches)
+                    else:
+                        done[name], kept = each.integrate_and_keep(patches)
+                        self.fusion.attach([kept])
         alone = [group for group in self.groups if not group.sums_up]
         if not alone:
             return done

@@ -135,10 +135,14 @@ class Binner:
 
         Raises OutOfRange for points beyond the index range.
         """
-        opened = self.open(self._shared("cells", self.width), exponents)
+        opened = self.open(self.shared(), exponents)
         cells = self.touch(opened, patches)
         self.add(cells, patches, values)
         return self.close(cells, self.grid.runtime.arena)
+
+    def shared(self) -> CellArrays:
+        """Arrays that all maps use in turn, for what is averaged at once."""
+        return self._shared("cells", self.width)
 
     def sort(self, samples: NDArray[np.float32], targets: NDArray[np.float32]) -> SortedSamples:
         """Sort samples (N, 3) world [m] with targets (N, c) by voxel; each is kept as it is.

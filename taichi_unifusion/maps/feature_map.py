@@ -23,6 +23,7 @@ from .base_map import BaseMap, Integration
 from .binner import Binner, patches_of
 from .encoder import check_points, to_device, window_masks, workers
 from .encoding import position_encoding
+from .kept_window import KeptCells, KeptFeatures
 from .local_lim import Binned
 from .property_map import NEAREST_REACH
 from .settings import MAX_FEATURE_CHANNELS, FeatureSettings, check_channels
@@ -126,14 +127,44 @@ class FeatureMap(BaseMap[FeatureSettings]):
         """Fuse the features that a frame's patches see into the map, as `integrate` does."""
         return self._integrate(patches, self._features_of(patches.features))
 
+    def integrate_and_keep(self, patches: Patches) -> tuple[Integration, KeptFeatures]:
+        """As `integrate_patches`; also what was fused, by value, which is what is kept of it."""
+        runtime.check_alive(self.grid.runtime)
+        binner = self.binner
+        opened = binner.touch(binner.open(binner.shared()), patches)
+        binner.add(opened, patches, [])
+        cells = KeptCells.of(opened, binner, [])
+        kept = KeptFeatures.of(self.name, cells, self._features_of(patches.features))
+        binned = binner.close(opened, self.grid.runtime.arena)
+        return self._fuse(binned, kept.image(), patches.total), kept
+
+    def integrate_kept(self, kept: KeptFeatures, T: NDArray[np.float64] | None) -> None:
+        """Fuse again what was kept, of points moved by T."""
+        binned = kept.cells.binned(self.binner, self.binner.shared(), T)
+        self._fuse(binned, kept.image(T), 0)
+
+    def clear(self) -> None:
+        """Forget all voxels."""
+        self.flush()
+        self.grid.clear()
+
     def _integrate(self, patches: Patches, features: ImageView) -> Integration:
         runtime.check_alive(self.grid.runtime)
-        image, usable = self._usable(features.values)
-        binned = self.binner.bin(patches, [])
+        image = self._usable(features.values)  # first: it may raise
+        return self._fuse(self.binner.bin(patches, []), features, patches.total, image)
+
+    def _fuse(
+        self,
+        binned: Binned,
+        features: ImageView,
+        points: int,
+        pixels: tuple[NDArray[np.float32], NDArray[np.uint8]] | None = None,
+    ) -> Integration:
+        image, usable = pixels or self._usable(features.values)
         starts = np.ascontiguousarray(binned.rows[:, 0])
         found = self._find_pixels(binned, starts, features, usable)
         if not found.seen.any():
-            return Integration(patches.total, 0, len(self))
+            return Integration(points, 0, len(self))
         slots = np.empty(binned.count, np.int32)
         encoded = self.grid.claim(binned.count, binned.keys, found.weights, slots)
         kernels.fuse_features(
@@ -152,7 +183,7 @@ class FeatureMap(BaseMap[FeatureSettings]):
             self._scratch,
             self._pools,
         )
-        return Integration(patches.total, encoded, len(self))
+        return Integration(points, encoded, len(self))
 
     def _features_of(self, images: Mapping[str, ImageView]) -> ImageView:
         features = images.get(self.name)

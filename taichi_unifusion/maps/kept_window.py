@@ -1,147 +1,154 @@
-"""KeptWindow: what a window was fused from, by value, so that it can be taken out again, exactly.
+"""KeptWindow: what a window was fused from, by value and small, so that it can be taken out again,
+exactly, and be fused elsewhere.
 
 A trajectory that a loop corrects moves whole windows: each is taken out at its old pose and fused
-anew. Encoding depends on whole numbers only, so the local LIM that is taken out is the one that was
-fused, to the bit.
+anew, moved as a rigid body with its keyframe.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.cells import BLOCK_CELLS
-from ..kernels.pools import copy_rows
-from ..types import PinholeCamera, PointCloud
-from .binner import patches_of
-from .local_lim import CellArrays, LocalLim, OpenCells
-from .property_group import Part
-from .surface_map import SurfaceMap
-from .voxel_grid import VoxelGrid
+from ..geometry.se3 import distance, inverse, normalized
+from ..kernels.keeping import shrink_depth
+from ..runtime import DeviceArray
+from ..types import ImageView, PinholeCamera
+from .kept_cells import KeptCells, Levels
+
+DEPTH_UNITS = 1000.0  # of a metre
+DEPTH_STEP = 2  # pixels from one that is kept to the next
+# [m, degrees] nearer than this to where it was fused first, a window lies exactly there: its cells
+# are those of the map then
+SNAP = 5e-4, 0.02
 
 
 @dataclass(frozen=True)
-class KeptCells:
-    """The sums in the cells of the voxels that a window's frames touched."""
+class KeptViews:
+    """The depth images of a window, small and in whole millimetres; all of them vote."""
 
-    keys: NDArray[np.int32]  # (B, 5) voxels, and bits of the frames that saw each
-    cells: NDArray[np.int32]  # (M,) cells that hold points, by block
-    sums: NDArray[np.int64]  # (M, 1 + c) counts, and fixed-point sums
-    exponents: tuple[int, ...]  # of the sums, as `OpenCells` has them
+    depth: NDArray[np.uint16]  # (K, h, w) [mm] 0: no reading
+    camera: PinholeCamera  # of these images
+    T_keyframe_camera: NDArray[np.float64]  # (K, 4, 4)
 
     @classmethod
-    def of(cls, open_cells: OpenCells) -> KeptCells:
-        """By value what is summed up."""
-        n, arrays = open_cells.count, open_cells.arrays
-        sums = arrays.sums.to_numpy()[:n].reshape(n * BLOCK_CELLS, -1)
-        cells = np.flatnonzero(sums[:, 0]).astype(np.int32)
-        keys = arrays.keys.to_numpy()[:n]
-        return cls(keys, cells, sums[cells].copy(), open_cells.exponents)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes that this takes."""
-        return self.keys.nbytes + self.cells.nbytes + self.sums.nbytes
-
-    def encoded(self, part: Part, arrays: CellArrays) -> LocalLim:
-        """The local LIM of a part, as it was fused; on loan from the arena of the runtime."""
-        binner, n = part.binner, len(self.keys)
-        centers = ((self.keys[:, :3] + np.float32(0.5)) * np.float32(binner.voxel_size)).astype(
-            np.float32
+    def of(
+        cls, images: DeviceArray, camera: PinholeCamera, T_keyframe_camera: NDArray[np.float64]
+    ) -> KeptViews:
+        """The first images (K, H, W) [m] of a window; of each row and column every DEPTH_STEPth."""
+        n, (height, width) = len(T_keyframe_camera), images.shape[1:]
+        depth = np.empty((n, -(-height // DEPTH_STEP), -(-width // DEPTH_STEP)), np.uint16)
+        shrink_depth(images, DEPTH_STEP, DEPTH_UNITS, depth)
+        small = PinholeCamera(
+            depth.shape[2],
+            depth.shape[1],
+            camera.fx / DEPTH_STEP,
+            camera.fy / DEPTH_STEP,
+            camera.cx / DEPTH_STEP,
+            camera.cy / DEPTH_STEP,
         )
-        patches = patches_of(PointCloud(centers), binner.grid.runtime.device)
-        touched = binner.touch(binner.open(arrays, self.exponents), patches)
-        # blocks have other numbers now
-        order = np.argsort(_codes(self.keys))[
-            np.argsort(np.argsort(_codes(arrays.keys.to_numpy()[:n])))
-        ]
-        block_of = np.argsort(order)
-        sums = np.zeros((n, BLOCK_CELLS, self.sums.shape[1]), np.int64)
-        sums[block_of[self.cells // BLOCK_CELLS], self.cells % BLOCK_CELLS] = self.sums
-        copy_rows(n, sums, arrays.sums)
-        copy_rows(n, np.ascontiguousarray(self.keys[order]), arrays.keys)
-        return part.encoder.encode(binner.close(touched, binner.grid.runtime.arena))
+        return cls(depth, small, T_keyframe_camera)
 
+    @property
+    def meters(self) -> NDArray[np.float32]:
+        """(K, h, w) [m]."""
+        return self.depth.astype(np.float32) / np.float32(DEPTH_UNITS)
 
-def _codes(keys: NDArray[np.int32]) -> NDArray[np.int64]:
-    """A number for each voxel (N, 3)."""
-    i, j, k = keys[:, :3].T.astype(np.int64) + (1 << 20)
-    return i << 42 | j << 21 | k
+    def T_camera_world(self, T_world_keyframe: NDArray[np.float64]) -> NDArray[np.float32]:
+        """(K, 3, 4) with the keyframe at a pose."""
+        T = inverse(T_world_keyframe @ self.T_keyframe_camera)
+        return np.ascontiguousarray(T[:, :3], np.float32)
 
 
 @dataclass(frozen=True)
-class Visible:
-    """What is known of the surface of all voxels of a map at one moment."""
+class KeptFeatures:
+    """What a frame brought to a map of features: the cells that it saw, and its feature pixels."""
 
-    evidence: NDArray[np.int8]  # (S, 64)
-    masks: NDArray[np.uint32]  # (S, 2)
-
-    @classmethod
-    def of(cls, grid: VoxelGrid) -> Visible:
-        n = grid.count
-        return cls(grid["evidence"].to_numpy()[:n], grid["masks"].to_numpy()[:n])
-
-
-@dataclass(frozen=True)
-class VisibleChange:
-    """Votes and support that a window brought."""
-
-    keys: NDArray[np.int32]  # (N, 3) voxels
-    votes: NDArray[np.int8]  # (N, 64)
-    support: NDArray[np.uint32]  # (N, 2) cells in which it was the first to see surface
+    name: str  # of the map
+    cells: KeptCells
+    numbers: NDArray[np.int8]  # (h, w, c) a pixel's features by its scale
+    scales: NDArray[np.float32]  # (h, w) NaN: the pixel is not finite
+    camera: PinholeCamera  # of the feature image
+    T_camera_world: NDArray[np.float64]  # (4, 4) where it was fused first
 
     @classmethod
-    def since(cls, before: Visible, grid: VoxelGrid) -> VisibleChange:
-        """What has changed in a grid."""
-        after, known = Visible.of(grid), len(before.masks)
-        votes, support = after.evidence.astype(np.int16), after.masks.copy()
-        votes[:known] -= before.evidence
-        support[:known] &= ~before.masks
-        slots = np.flatnonzero(votes.any(axis=1) | support.any(axis=1))
-        keys = grid["keys"].to_numpy()[slots]
-        return cls(keys, votes[slots].astype(np.int8), support[slots])
+    def of(cls, name: str, cells: KeptCells, image: ImageView) -> KeptFeatures:
+        """Of features of a frame in world coordinates."""
+        largest = np.abs(image.values).max(axis=2)
+        scales = np.where(np.isfinite(largest), np.maximum(largest, 1e-30) / 127, np.nan)
+        numbers = np.nan_to_num(np.rint(image.values / scales[..., None]))
+        return cls(
+            name,
+            cells,
+            numbers.astype(np.int8),
+            scales.astype(np.float32),
+            image.camera,
+            image.T_camera_cloud,
+        )
+
+    def image(self, T: NDArray[np.float64] | None = None) -> ImageView:
+        """The features as they were fused, of points moved by T."""
+        values = self.numbers.astype(np.float32) * self.scales[..., None]
+        moved = self.T_camera_world if T is None else normalized(self.T_camera_world @ inverse(T))
+        return ImageView(values, self.camera, moved)
 
     @property
     def nbytes(self) -> int:
-        return self.keys.nbytes + self.votes.nbytes + self.support.nbytes
+        """Bytes that this takes, not compressed."""
+        return self.cells.nbytes + self.numbers.nbytes + self.scales.nbytes
 
 
 @dataclass(frozen=True)
 class KeptWindow:
-    """A window that was fused: its keyframe, the sums of its frames, its views, and what its rays
-    changed.
-    """
+    """A window that was fused: where and from what."""
 
-    T_world_keyframe: NDArray[np.float64]
-    camera: PinholeCamera
-    depth: NDArray[np.float32]  # (K, H, W) [m] of its views
-    T_camera_world: NDArray[np.float32]  # (K, 3, 4)
+    frames: tuple[int, ...]  # places in the recording; the first is the keyframe
+    T_world_keyframe: NDArray[np.float64]  # (4, 4) where it was fused first
     cells: Mapping[tuple[str, ...], KeptCells]  # by the names of the maps of a part
-    visible: Mapping[str, VisibleChange]  # by the name of a map
+    views: KeptViews
+    features: Sequence[KeptFeatures] = field(default=())
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it takes, with the depth images."""
-        kept = sum(each.nbytes for each in (*self.cells.values(), *self.visible.values()))
-        return self.depth.nbytes + kept
+        """Bytes that it takes, not compressed."""
+        parts = (*self.cells.values(), *self.features)
+        return self.views.depth.nbytes + sum(each.nbytes for each in parts)
+
+    def motion(self, T_world_keyframe: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(4, 4) by which its points move when the keyframe comes to lie there; None: not at all."""
+        moved, turned = distance(self.T_world_keyframe, T_world_keyframe)
+        if moved <= SNAP[0] and np.degrees(turned) <= SNAP[1]:
+            return None
+        return normalized(T_world_keyframe @ inverse(self.T_world_keyframe))
 
 
-def take_visible(surface: SurfaceMap, change: VisibleChange) -> None:
-    """Take back the votes and the support of a window, before its voxels are taken out.
-
-    A cell keeps support that the window was the first to bring, if other windows have seen surface
-    there since.
+def placed(
+    frames: Sequence[int],
+    T_keyframe_camera: NDArray[np.float64],
+    T_world_camera: Mapping[int, NDArray[np.float64]],
+) -> NDArray[np.float64] | None:
+    """(4, 4) the pose of a window's keyframe that fits those of its frames best, by their places in
+    the recording; None where none of them has one.
     """
-    grid = surface.grid
-    slots = grid.slots_of(change.keys)
-    there = slots >= 0
-    slots, votes, support = slots[there], change.votes[there], change.support[there]
-    if len(slots):
-        surface.add_evidence(slots, -votes)
-        masks, evidence = grid["masks"].to_numpy(), grid["evidence"].to_numpy()[slots]
-        unseen = np.packbits(evidence <= 0, axis=1).view(">u4").astype(np.uint32)
-        masks[slots] &= ~(support & unseen)
-        grid["masks"].from_numpy(masks)
+    found = [
+        T_world_camera[frame] @ inverse(T)
+        for frame, T in zip(frames, T_keyframe_camera, strict=True)
+        if frame in T_world_camera
+    ]
+    return mean_pose(np.array(found)) if found else None
+
+
+def mean_pose(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) between poses (N, 4, 4) that differ little."""
+    if (T == T[0]).all():
+        return T[0]
+    U, _, Vt = np.linalg.svd(T[:, :3, :3].mean(axis=0))
+    mean = np.eye(4)
+    mean[:3, :3], mean[:3, 3] = U @ Vt, T[:, :3, 3].mean(axis=0)
+    return mean
+
+
+__all__ = ["KeptCells", "KeptFeatures", "KeptViews", "KeptWindow", "Levels"]

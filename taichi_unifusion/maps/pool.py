@@ -21,6 +21,8 @@ _TAICHI = {
     np.dtype(np.int32): ti.i32,
     np.dtype(np.int8): ti.i8,
     np.dtype(np.uint32): ti.u32,
+    np.dtype(np.uint16): ti.u16,
+    np.dtype(np.float64): ti.f64,
 }
 
 

@@ -95,6 +95,13 @@ class MapGroup:
             if isinstance(each, RegressionMap) and each.sums_up and each.wants(frame)
         ]
 
+    def part_of(self, names: tuple[str, ...]) -> Part | None:
+        """The maps of these names as they are encoded together; None where they are not here."""
+        found = [each for each in self.maps if each.name in names]
+        if len(found) == 1 == len(names) and isinstance(found[0], RegressionMap):
+            return Part((found[0],), found[0].binner, found[0].encoder)
+        return None
+
 
 class PropertyGroup(MapGroup):
     """Property maps that take their voxels, position features and factorised Gram matrices from one
@@ -145,6 +152,12 @@ class PropertyGroup(MapGroup):
         if len(together) < 2:
             return parts
         return [self._part(together), *(part for part in parts if part.maps[0] not in together)]
+
+    def part_of(self, names: tuple[str, ...]) -> Part | None:
+        together = [each for each in self.maps if each.name in names]
+        if len(together) != len(names) or len(names) < 2:
+            return super().part_of(names)
+        return self._part(together)
 
     def _integrate_together(
         self, maps: Sequence[PropertyMap], cloud: PointCloud

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..kernels import fusion
+from ..kernels.cells import BLOCK_CELLS
+from ..kernels.keeping import round_rows
 from ..kernels.layout import Layout
 from ..kernels.patches import Patches, Values
 from ..types import PointCloud
@@ -23,12 +25,42 @@ from .voxel_data import VoxelData, VoxelField, regression_fields
 from .voxel_grid import VoxelGrid
 
 
+# What is fused exactly is rounded to steps of one part in this: sums in float64 are exact to 5e8.
+STEPS = 2.0**24
+SUPPORTED = VoxelField("supported", np.dtype(np.uint16), (BLOCK_CELLS,))  # local LIMs, by cell
+
+
 class RegressionGrid(VoxelGrid):
-    """The voxels of a regression map, into which local LIMs are fused (Eq. 19)."""
+    """The voxels of a regression map, into which local LIMs are fused (Eq. 19).
+
+    With `sum_exactly`, F w and w are also kept as sums in which rounding has no part: the map is
+    then the same, to the bit, whatever was fused and taken out in between, and in whatever order.
+    """
 
     def __init__(self, layout: Layout, noise: float, more: Sequence[VoxelField] = ()) -> None:
         super().__init__(regression_fields(layout, tuple(more)))
         self.layout, self.noise = layout, noise
+        self.steps = 0.0  # of 1, to which local LIMs are rounded; 0: they are fused as they are
+
+    def sum_exactly(self, steps: float = STEPS) -> None:
+        """Keep exact sums from now on: of local LIMs rounded to one part in `steps`, a power of two."""
+        if self.steps:
+            return
+        self.steps, layout = steps, self.layout
+        name = "sums" if layout.information else "totals"
+        columns = layout.sums if layout.information else 1 + layout.latent_rows * layout.channels
+        before = self["sums"].to_numpy() if layout.information and self.count else None
+        self.add_pool(SUPPORTED)
+        self.add_pool(VoxelField(name, np.dtype(np.float64), (columns,)))
+        if not self.count:
+            return
+        if before is None:
+            weights = self["weights"].to_numpy().astype(np.float64)
+            latents = self["latents"].to_numpy().reshape(len(weights), -1)
+            before = np.column_stack([weights, np.rint(latents * steps) / steps * weights[:, None]])
+        self[name].from_numpy(before.astype(np.float64))
+        words = self["masks"].to_numpy().astype(">u4").view(np.uint8)
+        self["supported"].from_numpy(np.unpackbits(words, axis=1).astype(np.uint16))
 
     def fuse(self, local: LocalLim) -> int:
         """F <- (F w + F' w') / (w + w'), or the sums of one regression over all frames; returns the
@@ -46,10 +78,10 @@ class RegressionGrid(VoxelGrid):
     def take_out(self, local: LocalLim) -> int:
         """Undo `fuse`; returns the number of voxels that it touched.
 
-        Support is not cleared: other frames may have set it.
+        Support is cleared with `sum_exactly` alone: else other frames may have set it.
         """
         local.check()
-        slots = np.empty(local.count, np.int32)
+        slots = np.empty(max(local.count, 1), np.int32)
         known = self.find(local.count, local.keys, local.weights, slots)
         self._fuse(local, slots, -1.0)
         self.release(local.count, local.keys, slots)
@@ -57,6 +89,11 @@ class RegressionGrid(VoxelGrid):
 
     def _fuse(self, local: LocalLim, slots: NDArray[np.int32], sign: float) -> None:
         support = local.support if sign > 0 else np.zeros((local.count, 2), np.uint32)
+        if self.steps:
+            round_rows(local.count, self.steps, local.encoded, local.weights)
+            fusion.count_support(
+                local.count, slots, local.support, int(sign), self["supported"], self["masks"]
+            )
         if self.layout.information:
             fusion.fuse_information(
                 self.layout,
@@ -74,20 +111,13 @@ class RegressionGrid(VoxelGrid):
                 self["masks"],
                 self["latents"],
             )
+            return
+        what = self.layout, local.first, local.count, slots, local.encoded, local.weights
+        maps = self["latents"], self["weights"]
+        if self.steps:
+            fusion.fuse_exactly(*what, int(sign), self["totals"], *maps)
         else:
-            fusion.fuse(
-                self.layout,
-                local.first,
-                local.count,
-                slots,
-                local.encoded,
-                local.weights,
-                support,
-                sign,
-                self["latents"],
-                self["weights"],
-                self["masks"],
-            )
+            fusion.fuse(*what, support, sign, *maps, self["masks"])
 
 
 class RegressionMap(BaseMap[S]):

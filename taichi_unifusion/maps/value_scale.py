@@ -14,6 +14,7 @@ from .base_map import BaseMap
 # brought to the upper one, below which sums of two million pixels have room for values four times as large.
 LEAST, MOST, ROOM = -8, 16, 18  # exponents of two
 FINE = 12  # bits that the largest value of a frame must have
+STEP_BITS = 24  # of the steps in which latents are summed exactly
 FARTHEST = 120  # of an exponent, so that two to it is an ordinary float32
 
 
@@ -34,6 +35,11 @@ def by_channel(maps: Sequence[BaseMap], exponents: Sequence[int]) -> tuple[int, 
 def exponents_for(maps: Sequence[BaseMap], frame: Frame) -> tuple[int, ...]:
     """For each channel of the maps, by what a frame carries."""
     return by_channel(maps, [exponent_of(frame.largest.get(each.name, 1.0)) for each in maps])
+
+
+def steps_for(exponents: Sequence[int]) -> float:
+    """Steps of 1 that are fine enough for values of these exponents: 2^-24 of the largest."""
+    return 2.0 ** (STEP_BITS - min([0, *(e + MOST for e in exponents if e < 0)]))
 
 
 def fits(maps: Sequence[BaseMap], exponents: Sequence[int], frame: Frame) -> bool:

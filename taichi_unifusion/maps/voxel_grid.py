@@ -215,6 +215,19 @@ class VoxelGrid:
         runtime.synchronize()
         self.empty += int(released[0])
 
+    def add_pool(self, field: VoxelField) -> None:
+        """Keep something more of every voxel, 0 at first, that no file holds."""
+        self._pools[field.name] = Pool(field, self.capacity)
+
+    def clear(self) -> None:
+        """Remove all voxels."""
+        self.retain(np.empty(0, np.int32))
+
+    def compact(self, least: int = 4096) -> None:
+        """Give the slots of removed voxels back where they are many: at least so many, and a third."""
+        if self.empty and self.empty >= max(least, self.count // 3):
+            self.retain(self.used_slots())
+
     def used_slots(self) -> NDArray[np.int32]:
         """Slots that hold a voxel."""
         if not self.empty:
@@ -244,7 +257,10 @@ class VoxelGrid:
     def take(self, slots: NDArray[np.int32]) -> VoxelData:
         """The voxels in `slots` by value, in that order."""
         slots = np.ascontiguousarray(slots)
-        fields = {field.name: self._pools[field.name].take(slots) for field in self.fields}
+        fields = {
+            field.name: self._pools[field.name].take(slots).astype(field.dtype, copy=False)
+            for field in self.fields
+        }
         return VoxelData(self._pools[KEYS.name].take(slots), fields)
 
     def retain(self, slots: NDArray[np.int32]) -> None:

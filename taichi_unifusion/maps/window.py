@@ -24,12 +24,12 @@ from ..geometry.se3 import distance, inverse
 from ..kernels.patches import Patches, Targets
 from ..runtime import Arena, DeviceArray
 from ..types import Frame, PinholeCamera
-from .kept_window import KeptCells, KeptWindow, Visible, VisibleChange, take_visible
+from .kept_window import KeptCells, KeptFeatures, KeptViews, KeptWindow
 from .local_lim import CellArrays, OpenCells
 from .property_group import MapGroup, Part
 from .regression_map import RegressionMap
 from .surface_map import SurfaceMap
-from .value_scale import exponents_for, fits
+from .value_scale import exponents_for, fits, steps_for
 
 # A window ends where the camera has moved this far from its first frame [m, degrees]: from there
 # fewer voxels are shared, and a window that a loop moves would bend.
@@ -70,6 +70,11 @@ class OpenPart:
     def bytes(self) -> int:
         return self.cells.count * self.cells.arrays.block_bytes
 
+    def kept_cells(self) -> KeptCells:
+        """What is summed up, which becomes what is kept of it."""
+        channels = [each.channels for each in self.part.maps]
+        return KeptCells.of(self.cells, self.part.binner, channels)
+
 
 @dataclass
 class Window:
@@ -84,6 +89,8 @@ class Window:
     parts: dict[tuple[str, ...], OpenPart]  # by the names of their maps
     others: bool  # whether other maps want patches too
     T_camera_world: list[NDArray[np.float64]] = field(default_factory=list)  # of the views
+    frames: list[int] = field(default_factory=list)  # their places in the recording
+    features: list[KeptFeatures] = field(default_factory=list)  # that they brought to other maps
 
     def __len__(self) -> int:
         """Frames summed up."""
@@ -136,6 +143,7 @@ class Window:
             if each not in direct:
                 each.part.binner.add(each.cells, patches, each.part.carried(patches), len(self))
         self.T_camera_world.append(inverse(frame.require_pose()))
+        self.frames.append(frame.index)
         touched = {
             name: each.cells.count - before[names].count
             for names, each in self.parts.items()
@@ -189,15 +197,14 @@ class Window:
 
     def close(self, keep: Keep | None = None) -> list[Piece]:
         """The work that fuses the window, in order; the sums are free for another one. `keep` is
-        told in the end what it was.
+        told in the end what it was; what is fused is then what is kept.
         """
-        cells = {names: KeptCells.of(each.cells) for names, each in self.parts.items() if keep}
+        kept = {} if keep is None else self.parts
+        cells = {names: each.kept_cells() for names, each in kept.items()}
         pieces = [piece for each in self.parts.values() for piece in self._pieces(each)]
-        if keep is None:
-            return pieces
-        name, surfaces, before = pieces[0].name, self.surfaces, {}
-        first = Piece(name, lambda: before.update({s.name: Visible.of(s.grid) for s in surfaces}))
-        return [first, *pieces, Piece(name, lambda: keep(self._kept(cells, before)))]
+        if keep is not None:
+            pieces.append(Piece("keep", lambda: keep(self._kept(cells))))
+        return pieces
 
     @property
     def surfaces(self) -> list[SurfaceMap]:
@@ -205,12 +212,11 @@ class Window:
         maps = [each for part in self.parts.values() for each in part.part.maps]
         return [each for each in maps if isinstance(each, SurfaceMap) and each.settings.carve]
 
-    def _kept(
-        self, cells: Mapping[tuple[str, ...], KeptCells], before: Mapping[str, Visible]
-    ) -> KeptWindow:
-        changes = {s.name: VisibleChange.since(before[s.name], s.grid) for s in self.surfaces}
-        depth = self.images.to_numpy()[: len(self)]
-        return KeptWindow(self.T_world_keyframe, self.camera, depth, self._poses(), cells, changes)
+    def _kept(self, cells: Mapping[tuple[str, ...], KeptCells]) -> KeptWindow:
+        T_keyframe_camera = inverse(np.array(self.T_camera_world) @ self.T_world_keyframe)
+        views = KeptViews.of(self.images, self.camera, T_keyframe_camera)
+        frames, features = tuple(self.frames), tuple(self.features)
+        return KeptWindow(frames, self.T_world_keyframe, cells, views, features)
 
     def _poses(self) -> NDArray[np.float32]:
         """(K, 3, 4) T_camera_world of the views."""
@@ -252,6 +258,7 @@ class WindowFusion:
     ) -> None:
         self.size, self.keep, self.settle = size, keep, settle
         self.window: Window | None = None
+        self._last: Window | None = None  # the window of the last frame, which may be closed
         self.pieces: deque[Piece] = deque()
         self._begun: Piece | None = None  # that was handed out, and is not done
         self._rehearsals: list[Piece] = []  # for the first frame that has something for a part
@@ -301,7 +308,7 @@ class WindowFusion:
             ]
         if self._index and not self._stride:
             self._stride = abs(frame.index - self._index)
-        self.window, self._index = window, frame.index
+        self.window, self._last, self._index = window, window, frame.index
         for part in parts:
             for each in part.maps:
                 each.waiting = self
@@ -360,31 +367,16 @@ class WindowFusion:
         self.run(len(self.pieces))
         self._release()
 
-    def take_out(self, kept: KeptWindow) -> None:
-        """Undo what fusing a window did to the maps, which then hold what they did before; windows
-        that were fused since stay.
-        """
-        self.flush()
-        for names, cells in kept.cells.items():
-            part, arrays = self._known[names], self._room[names][0]
-            for each in _surfaces(part, kept):
-                take_visible(each, kept.visible[each.name])
-            part.take_out(cells.encoded(part, arrays))
+    def part(self, names: tuple[str, ...], groups: Sequence[MapGroup]) -> tuple[Part, CellArrays]:
+        """Maps that are encoded together, and room to sum up what they take; none must be open."""
+        if names not in self._known:
+            self._known[names] = next(part for g in groups if (part := g.part_of(names)))
+        return self._known[names], self._room_of(self._known[names])[0]
 
-    def put_back(self, kept: KeptWindow) -> KeptWindow:
-        """Fuse a window again that was taken out; returns it with what its rays changed this time."""
-        self.flush()
-        changes = {}
-        for names, cells in kept.cells.items():
-            part, arrays = self._known[names], self._room[names][0]
-            surfaces = _surfaces(part, kept)
-            before = {each.name: Visible.of(each.grid) for each in surfaces}
-            part.fuse(cells.encoded(part, arrays))
-            for each in surfaces:
-                slots = (0, each.grid.count)
-                each.vote(kept.depth, kept.camera, kept.T_camera_world, slots)
-                changes[each.name] = VisibleChange.since(before[each.name], each.grid)
-        return replace(kept, visible=changes)
+    def attach(self, features: Sequence[KeptFeatures]) -> None:
+        """Keep what the last frame brought to maps of features with the window that it lies in."""
+        if self._last is not None:
+            self._last.features.extend(features)
 
     def _release(self) -> None:
         """Let go of the maps if nothing waits for them."""
@@ -399,12 +391,18 @@ class WindowFusion:
         return not gap and same and window.is_near(frame)
 
     def _open(self, part: Part, frame: Frame) -> OpenPart:
+        arrays, arena = self._room_of(part)
+        self._known[part.names] = part
+        exponents = exponents_for(part.maps, frame)
+        if self.keep is not None:
+            for each in part.maps:
+                each.grid.sum_exactly(steps_for(exponents))
+        return OpenPart(part, part.binner.open(arrays, exponents), arena)
+
+    def _room_of(self, part: Part) -> tuple[CellArrays, Arena]:
         if part.names not in self._room:
             self._room[part.names] = CellArrays(part.binner.width), Arena()
-        self._known[part.names] = part
-        arrays, arena = self._room[part.names]
-        exponents = exponents_for(part.maps, frame)
-        return OpenPart(part, part.binner.open(arrays, exponents), arena)
+        return self._room[part.names]
 
     def _free_images(self, frame: Frame) -> DeviceArray:
         """Room for the views of a window that begins; those of the one before may still vote."""
@@ -415,9 +413,3 @@ class WindowFusion:
             self._images = [ti.ndarray(ti.f32, shape) for _ in range(2 if self.size > 1 else 1)]
         return self._images[0]
 
-
-def _surfaces(part: Part, kept: KeptWindow) -> list[SurfaceMap]:
-    """The maps of a part in which the rays of a window voted."""
-    return [
-        each for each in part.maps if isinstance(each, SurfaceMap) and each.name in kept.visible
-    ]

@@ -13,7 +13,7 @@ from taichi_unifusion.config import Config
 from taichi_unifusion.maps import PropertyGroup, PropertyMap
 from taichi_unifusion.maps.settings import PropertySettings, SurfaceSettings
 from taichi_unifusion.maps.value_scale import exponent_of
-from taichi_unifusion.maps.window import WindowFusion
+from taichi_unifusion.maps.window_store import WindowStore
 from taichi_unifusion.types import Frame, PinholeCamera, PointCloud, largest_magnitude
 
 FLOAT32 = 2e-5  # relative: a regression of float32 numbers that are all the same
@@ -161,14 +161,13 @@ def test_colour_that_is_no_longer_in_0_to_1_does_not_mix_with_bytes():
 
 
 def test_a_window_of_large_values_is_taken_out_exactly():
-    kept = []
     config = Config(device=DEVICE, window=2, surface=SurfaceSettings(voxel_size=0.1))
-    pipeline = uf.Pipeline(config, [Carried("c")], keep=kept.append)
+    pipeline = uf.Pipeline(config, [Carried("c")], keep=WindowStore())
     for i in range(4):
         pipeline.step(frame_of(i, c=1e12 if i < 2 else 3e12))
     pipeline.flush()
-    assert isinstance(pipeline.fusion, WindowFusion) and len(kept) == 2
-    pipeline.fusion.take_out(kept[1])
+    pipeline.follower.move_to({1: None})
+    pipeline.follower.finish()
     points = pipeline.extract_mesh().vertices
     np.testing.assert_allclose(pipeline.properties["c"].query(points), 1e12, rtol=1e-4)
 
