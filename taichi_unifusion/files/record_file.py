@@ -95,9 +95,7 @@ def unpack_record(packed: bytes) -> tuple[dict[str, Any], dict[str, NDArray]]:
     return content["values"], unpack(Path("memory"), tuple(content["arrays"]), body)
 
 
-def unpack(
-    path: Path, entries: tuple[Mapping[str, Any], ...], body: bytes
-) -> dict[str, NDArray]:
+def unpack(path: Path, entries: tuple[Mapping[str, Any], ...], body: bytes) -> dict[str, NDArray]:
     """The arrays of a body; raises FileError where an entry does not fit it."""
     arrays, at = {}, 0
     for entry in entries:
@@ -148,9 +146,7 @@ def _next(path: Path, file: IO[bytes], end: int) -> Record | None:
     if len(header) < length or zlib.crc32(header) != header_sum or file.tell() + size > end:
         return None
     content = json.loads(header)
-    record = Record(
-        path, content["values"], tuple(content["arrays"]), file.tell(), size, body_sum
-    )
+    record = Record(path, content["values"], tuple(content["arrays"]), file.tell(), size, body_sum)
     file.seek(size, os.SEEK_CUR)
     return record
 
@@ -205,7 +201,7 @@ class RecordLog:
 def _deflate(array: NDArray) -> bytes:
     """Bytes of equal weight side by side: they are alike."""
     planes = array.reshape(-1).view(np.uint8).reshape(-1, array.dtype.itemsize).T
-    return zlib.compress(np.ascontiguousarray(planes), ZLIB_LEVEL)
+    return zlib.compress(np.ascontiguousarray(planes).tobytes(), ZLIB_LEVEL)
 
 
 def _inflate(data: bytes, dtype: np.dtype, shape: tuple[int, ...]) -> NDArray:

@@ -48,8 +48,10 @@ class Fusing(Protocol):
     """What fuses windows into maps: a pipeline."""
 
     fusion: WindowFusion
-    maps: dict[str, BaseMap]
-    groups: list[MapGroup]
+    groups: list[MapGroup]  # of the maps, once these were asked for
+
+    @property
+    def maps(self) -> dict[str, BaseMap]: ...
 
 
 class MapFollower:
@@ -225,13 +227,12 @@ class MapFollower:
         self.store.place({number: target})
         self._settled = False
         spent = time.perf_counter() - started
-        self.done = replace(
-            self.done, moves=self.done.moves + 1, seconds=self.done.seconds + spent
-        )
+        self.done = replace(self.done, moves=self.done.moves + 1, seconds=self.done.seconds + spent)
 
     def _fuse(self, window: KeptWindow, T_world_keyframe: Pose, sign: int) -> None:
         """Fuse the local LIMs of a window at a pose, or take them out."""
         motion = window.motion(T_world_keyframe)
+        assert self.fusing.maps  # they are made when they are asked for
         for names, cells in window.cells.items():
             part, arrays = self.fusing.fusion.part(names, self.fusing.groups)
             for each in part.maps:

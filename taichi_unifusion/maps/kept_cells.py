@@ -64,7 +64,7 @@ class Levels:
     @property
     def values(self) -> NDArray[np.float32]:
         """(M, c)."""
-        return self.first + self.step * self.numbers.astype(np.float32)
+        return (self.first + self.step * self.numbers.astype(np.float32)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,8 @@ class KeptCells:
     @property
     def means(self) -> NDArray[np.float32]:
         """(M, c) averages, scaled by the exponents."""
-        return np.hstack([each.values for each in self.levels] or [np.empty((len(self.counts), 0))])
+        empty = np.empty((len(self.counts), 0), np.float32)
+        return np.hstack([empty, *(each.values for each in self.levels)], dtype=np.float32)
 
     def sums(self) -> NDArray[np.int64]:
         """(M, 1 + c) counts, then fixed-point sums."""
@@ -136,10 +137,10 @@ class KeptCells:
     def points(self, voxel_size: float, with_positions: bool) -> NDArray[np.float32]:
         """(M, 3) [m] where the average of each cell lies, or its centre."""
         rows, places = self.cells
-        inner = (OFFSETS[places] + 0.5) / CELLS
+        inner = (OFFSETS[places] + np.float32(0.5)) / np.float32(CELLS)
         if with_positions:
             inner += self.levels[-1].values
-        return (self.keys[rows] + inner) * np.float32(voxel_size)
+        return ((self.keys[rows] + inner) * np.float32(voxel_size)).astype(np.float32)
 
     def binned(
         self, binner: Binner, arrays: CellArrays, T: NDArray[np.float64] | None = None
@@ -188,9 +189,7 @@ class KeptCells:
         )
         return binner.close(opened, binner.grid.runtime.arena)
 
-    def _carried(
-        self, binner: Binner, cloud: PointCloud, T: NDArray[np.float64]
-    ) -> list[Values]:
+    def _carried(self, binner: Binner, cloud: PointCloud, T: NDArray[np.float64]) -> list[Values]:
         """What moved points carry: normals that turn with them, or values."""
         if isinstance(binner, SurfelBinner):
             normals = self.levels[0].values.astype(np.float64) @ T[:3, :3].T

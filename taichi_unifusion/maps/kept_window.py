@@ -143,7 +143,7 @@ def placed(
 
 def mean_pose(T: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) between poses (N, 4, 4) that differ little."""
-    if (T == T[0]).all():
+    if (T[0] == T).all():
         return T[0]
     U, _, Vt = np.linalg.svd(T[:, :3, :3].mean(axis=0))
     mean = np.eye(4)

@@ -24,7 +24,6 @@ from .local_lim import LocalLim
 from .voxel_data import VoxelData, VoxelField, regression_fields
 from .voxel_grid import VoxelGrid
 
-
 # What is fused exactly is rounded to steps of one part in this: sums in float64 are exact to 5e8.
 STEPS = 2.0**24
 SUPPORTED = VoxelField("supported", np.dtype(np.uint16), (BLOCK_CELLS,))  # local LIMs, by cell

@@ -412,4 +412,3 @@ class WindowFusion:
             self.run(len(self.pieces))
             self._images = [ti.ndarray(ti.f32, shape) for _ in range(2 if self.size > 1 else 1)]
         return self._images[0]
-

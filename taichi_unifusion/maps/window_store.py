@@ -154,9 +154,7 @@ class WindowStore:
                 for number, T in values["places"].items():
                     self.windows[int(number)].place = None if T is None else _pose(T)
         except (KeyError, ValueError, TypeError, IndexError) as error:
-            raise FileError(
-                f"{record.path}: damaged ({error}); make the results again"
-            ) from None
+            raise FileError(f"{record.path}: damaged ({error}); make the results again") from None
 
 
 def _pose(values: Any) -> NDArray[np.float64]:
@@ -244,9 +242,7 @@ def _put_cells(
 def _get_cells(at: str, values: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> KeptCells:
     keys = arrays[f"{at}.keys"].astype(np.int32) + np.array(values["low"], np.int32)
     levels = tuple(
-        Levels(
-            arrays[f"{at}.values{i}"], np.array(first, np.float32), np.array(step, np.float32)
-        )
+        Levels(arrays[f"{at}.values{i}"], np.array(first, np.float32), np.array(step, np.float32))
         for i, (first, step) in enumerate(values["scales"])
     )
     return KeptCells(

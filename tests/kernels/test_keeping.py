@@ -10,7 +10,8 @@ from scenes import rough
 from taichi_unifusion.kernels import fusion, keeping
 from taichi_unifusion.kernels.index import forget_blocks, touch_points
 from taichi_unifusion.kernels.layout import Layout
-from taichi_unifusion.maps.voxel_grid import MASKS, WEIGHTS, VoxelGrid, latents
+from taichi_unifusion.maps.voxel_data import MASKS, WEIGHTS, latents
+from taichi_unifusion.maps.voxel_grid import VoxelGrid
 
 MEAN = 1e-6  # float32 of values about 1
 VS = 0.05
@@ -104,10 +105,14 @@ def test_local_lims_are_summed_exactly_and_taken_out_again(grid):
         fusion.fuse_exactly(layout, 1, 1, slots, latent, weight, sign, totals, F, w)
         fusion.count_support(1, slots, words, sign, counts, masks)
         done = [*done, k] if sign > 0 else [n for n in done if n != k]
-        wanted, total = twin.fuse_exactly([parts[n] for n in done] or [parts[0]], [1] * len(done) or [0])
+        wanted, total = twin.fuse_exactly(
+            [parts[n] for n in done] or [parts[0]], [1] * len(done) or [0]
+        )
         assert w[1] == total
         np.testing.assert_array_equal(F[1], wanted.astype(np.float32))
         found = np.unpackbits(masks[1].astype(">u4").view(np.uint8)).astype(bool)
-        seen = twin.count_support([supports[n] for n in done] or [supports[0]], [1] * len(done) or [0])
+        seen = twin.count_support(
+            [supports[n] for n in done] or [supports[0]], [1] * len(done) or [0]
+        )
         np.testing.assert_array_equal(found, seen)
     assert not totals.any() and not w[0]

@@ -86,9 +86,7 @@ def test_keeping_windows_hardly_changes_a_map(frames):
 
 def test_the_store_says_what_it_holds(frames):
     store = kept_run(frames).follower.store
-    assert [kept.frames for kept in store.windows] == [
-        tuple(range(n, n + 4)) for n in (1, 5, 9)
-    ]
+    assert [kept.frames for kept in store.windows] == [tuple(range(n, n + 4)) for n in (1, 5, 9)]
     window = store[1]
     np.testing.assert_array_equal(window.T_world_keyframe, frames[4].T_world_camera)
     assert window.views.depth.shape == (4, 24, 32)
@@ -209,7 +207,9 @@ def test_a_store_in_a_file_is_read_back_and_goes_on(frames, tmp_path):
     fresh.follower.settle()
     assert contents(fresh) == contents(pipeline)
     size = path.stat().st_size
-    with path.open("r+b") as file:  # as after a power cut: the last window was not written to its end
+    with path.open(
+        "r+b"
+    ) as file:  # as after a power cut: the last window was not written to its end
         file.truncate(size - 5)
     again = WindowStore(path)
     assert len(again) == 3 and again.windows[2].place is not None

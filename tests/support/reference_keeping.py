@@ -29,9 +29,7 @@ def scatter_cells(sums, blocks, places, rows):
 def mark_points(voxels, points, bits, voxel_size):
     """(B,) for every voxel the bits of all points in it."""
     at = np.floor(points / voxel_size).astype(int)
-    return np.array(
-        [np.bitwise_or.reduce(bits[(at == v).all(axis=1)], initial=0) for v in voxels]
-    )
+    return np.array([np.bitwise_or.reduce(bits[(at == v).all(axis=1)], initial=0) for v in voxels])
 
 
 def shrink_depth(images, step, per_meter):
