@@ -30,8 +30,8 @@ from .maps.property_group import group_maps
 from .maps.settings import PropertySettings
 from .maps.tiled_mesh import joined_mesh
 from .maps.window import WindowFusion
-from .maps.working_set import make_memory
 from .maps.window_store import WindowStore
+from .maps.working_set import make_memory
 from .networks.encoders import ImageEncoder
 from .preprocessing import FARTHEST, PreprocessSettings, find_patches, invert_depth, preprocess
 from .properties import SurfaceProperty, make_property
