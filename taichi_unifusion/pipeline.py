@@ -7,8 +7,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol, cast
@@ -33,9 +32,17 @@ from .maps.window import WindowFusion
 from .maps.window_store import WindowStore
 from .maps.working_set import make_memory
 from .networks.encoders import ImageEncoder
-from .preprocessing import FARTHEST, PreprocessSettings, find_patches, invert_depth, preprocess
+from .preprocessing import find_patches, invert_depth, preprocess, why_empty
 from .properties import SurfaceProperty, make_property
-from .run_log import SKIP_REASONS, EmptyFrame, RunLog, RunResult, SkippedFrame, StepResult
+from .run_log import (
+    SKIP_REASONS,
+    EmptyFrame,
+    RunLog,
+    RunResult,
+    SkippedFrame,
+    StageClock,
+    StepResult,
+)
 from .types import Frame, Mesh, PinholeCamera
 
 logger = logging.getLogger(__name__)
@@ -178,7 +185,7 @@ class Pipeline:
         clock, live = StageClock(self.synchronize), runtime.current()
         T_world_camera = frame.require_pose()
         if not self.settle([frame]):
-            raise EmptyFrame(f"{frame.label}: {_why_empty(frame, self.config.preprocess)}")
+            raise EmptyFrame(f"{frame.label}: {why_empty(frame, self.config.preprocess)}")
         if not live.warm:  # once, also where the first frames turn out to be of no use
             logger.info("compiling kernels (once a process)")
             live.warm = True
@@ -195,7 +202,7 @@ class Pipeline:
                 frame, find, reach, self.groups, bool(frame.features)
             )
         if patches.total == 0:
-            raise EmptyFrame(f"{frame.label}: {_why_empty(frame, self.config.preprocess)}")
+            raise EmptyFrame(f"{frame.label}: {why_empty(frame, self.config.preprocess)}")
         done = self._integrate_alone(frame, patches, clock)
         for piece in self.fusion.due():
             with clock.stage(piece.name):
@@ -414,35 +421,3 @@ def warm_up(config: Config | None = None) -> None:
     pipeline.step(Frame(depth, camera, color, np.eye(4)))
     pipeline.flush()
     pipeline.extract_mesh()
-
-
-@dataclass
-class StageClock:
-    """Milliseconds by stage; with `synchronize`, the device's work is included."""
-
-    synchronize: bool = True
-    milliseconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        if self.synchronize:
-            runtime.synchronize()
-        spent = 1e3 * (time.perf_counter() - start)
-        self.milliseconds[name] = self.milliseconds.get(name, 0.0) + spent
-
-
-def _why_empty(frame: Frame, settings: PreprocessSettings) -> str:
-    positive = np.isfinite(frame.depth) & (frame.depth > 0)
-    readings = frame.depth[positive & (frame.depth <= FARTHEST)]
-    if not len(readings):
-        beyond = f" up to {FARTHEST:g} m" if positive.any() else ""
-        return f"the depth image holds no reading at all{beyond}"
-    if not ((readings >= settings.depth_min) & (readings <= settings.depth_max)).any():
-        return (
-            f"all depth readings lie outside {settings.depth_min:g}..{settings.depth_max:g} m "
-            f"(median {np.median(readings):.3g} m); is the depth scale wrong? "
-            "Else see preprocess.depth_min and depth_max"
-        )
-    return f"all {len(readings)} depth readings lie on edges, on grazing surfaces or too far apart"

@@ -225,6 +225,22 @@ def normal_image(frame: Frame, settings: PreprocessSettings | None = None) -> ND
     return normals
 
 
+def why_empty(frame: Frame, settings: PreprocessSettings) -> str:
+    """Why no pixel of a frame can be used, as a clause."""
+    positive = np.isfinite(frame.depth) & (frame.depth > 0)
+    readings = frame.depth[positive & (frame.depth <= FARTHEST)]
+    if not len(readings):
+        beyond = f" up to {FARTHEST:g} m" if positive.any() else ""
+        return f"the depth image holds no reading at all{beyond}"
+    if not ((readings >= settings.depth_min) & (readings <= settings.depth_max)).any():
+        return (
+            f"all depth readings lie outside {settings.depth_min:g}..{settings.depth_max:g} m "
+            f"(median {np.median(readings):.3g} m); is the depth scale wrong? "
+            "Else see preprocess.depth_min and depth_max"
+        )
+    return f"all {len(readings)} depth readings lie on edges, on grazing surfaces or too far apart"
+
+
 def _averages(
     name: str, frame: Frame, found: DeviceArray, places: DeviceArray, counts: DeviceArray
 ) -> Values:

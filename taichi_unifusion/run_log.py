@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from . import runtime
 from .datasets.file_recording import Recording
 from .datasets.loading import index_in_recording, recording_of
 from .datasets.plausibility import guess_depth_scale, is_reading
@@ -37,6 +39,23 @@ SKIP_REASONS: dict[type[UniFusionError], str] = {  # the first class that fits n
     FrameError: "unreadable image",
     OutOfRange: "outside the range of the map",
 }
+
+
+@dataclass
+class StageClock:
+    """Milliseconds by stage; with `synchronize`, the device's work is included."""
+
+    synchronize: bool = True
+    milliseconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        if self.synchronize:
+            runtime.synchronize()
+        spent = 1e3 * (time.perf_counter() - start)
+        self.milliseconds[name] = self.milliseconds.get(name, 0.0) + spent
 
 
 @dataclass(frozen=True)
