@@ -153,46 +153,27 @@ def header_stamp(data: bytes, ros1: bool) -> int:
 
 
 class _Decoder:
-    """Turns the bytes of messages into messages, by rosbags."""
+    """Turns the bytes of messages into messages, by rosbags and ROS's own definitions of their types; those in
+    the bag may be damaged, and are of types that are not read here.
+    """
 
     def __init__(self, topics: Mapping[str, BagTopic]) -> None:
         try:
-            from rosbags.typesys import (
-                Stores,
-                get_types_from_idl,
-                get_types_from_msg,
-                get_typestore,
-            )
+            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
         except ImportError:
             raise missing_rosbags() from None
         ros1 = any(topic.ros1 for topic in topics.values())
-        self.usual = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
-        self.own = get_typestore(Stores.EMPTY)
-        if ros1:  # which ROS 1's store of rosbags lacks
-            text = "geometry_msgs/TransformStamped[] transforms"
-            self.usual.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-        types: dict[str, Any] = {}
-        for topic in topics.values():
-            if topic.definition:
-                try:
-                    types.update(
-                        get_types_from_idl(topic.definition)
-                        if topic.idl
-                        else get_types_from_msg(topic.definition, topic.type)
-                    )
-                except Exception:  # noqa: BLE001 a damaged definition: the usual one has to do
-                    continue
-        try:
-            self.own.register(types)
-        except Exception:  # noqa: BLE001
-            self.own = get_typestore(Stores.EMPTY)
+        self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.LATEST)
+        for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+            if name not in self.store.fielddefs:
+                text = "geometry_msgs/TransformStamped[] transforms"
+                self.store.register(get_types_from_msg(text, name))
 
     def __call__(self, topic: BagTopic, data: bytes, where: str) -> Any:
-        store = self.own if topic.type in self.own.fielddefs else self.usual
         try:
             if topic.ros1:
-                return store.deserialize_ros1(data, topic.type)
-            return store.deserialize_cdr(data, topic.type)
+                return self.store.deserialize_ros1(data, topic.type)
+            return self.store.deserialize_cdr(data, topic.type)
         except Exception as error:  # of the generated code: any
             raise FrameError(
                 f"{where} cannot be read as {topic.type} ({type(error).__name__})"

@@ -42,8 +42,6 @@ class BagTopic:
     name: str
     type: str  # as ROS 2 writes it: sensor_msgs/msg/Image
     ros1: bool = False  # serialised by ROS 1; else CDR
-    definition: str = ""  # of the type, if the recording holds it
-    idl: bool = False  # the definition is in OMG's language
 
 
 @dataclass(frozen=True)

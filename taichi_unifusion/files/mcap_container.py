@@ -20,7 +20,7 @@ class Mcap(ChunkedBag):
     """A `.mcap` with messages of ROS."""
 
     def scan(self) -> None:
-        self.schemas: dict[int, tuple[str, str, str]] = {}
+        self.schemas: dict[int, str] = {}  # names of types
         self.refused: set[str] = set()  # encodings of messages that we do not read
         if self.size < len(MAGIC) or self.file.read(0, len(MAGIC)) != MAGIC:
             raise DatasetError(f"{self.path}: not an MCAP file")
@@ -68,7 +68,7 @@ class Mcap(ChunkedBag):
         elif kind == SCHEMA:
             content = _Content(self._small(span, data, length))
             number = content.number("<H")
-            self.schemas[number] = content.text(), content.text(), content.text()
+            self.schemas[number] = content.text()
         elif kind == CHANNEL:
             content = _Content(self._small(span, data, length))
             number, schema, name, encoding = (
@@ -80,13 +80,10 @@ class Mcap(ChunkedBag):
             if encoding not in ENCODINGS:
                 self.refused.add(encoding)
                 return
-            type_name, language, definition = self.schemas.get(schema, ("", "", ""))
+            type_name = self.schemas.get(schema, "")
             if type_name.count("/") == 1:
                 type_name = type_name.replace("/", "/msg/")
-            topic = BagTopic(
-                name, type_name, ENCODINGS[encoding], definition, language.endswith("idl")
-            )
-            self.add_channel(number, topic)
+            self.add_channel(number, BagTopic(name, type_name, ENCODINGS[encoding]))
 
     def _small(self, span: Span, data: int, length: int) -> bytes:
         if length > LARGEST:

@@ -85,7 +85,6 @@ class Rosbag1(ChunkedBag):
                 topic.decode("utf-8", "replace"),
                 f"{package}/msg/{name}" if "/" not in package else kind,
                 ros1=True,
-                definition=more.get(b"message_definition", b"").decode("utf-8", "replace"),
             ),
         )
 

@@ -18,6 +18,8 @@ from ..errors import DatasetError, FrameError
 from .chunked_bag import BagTopic
 
 BLOCK = 1 << 30  # bytes of a message; more means a damaged file
+STEPS = 10_000  # of SQLite's program between two looks at how long it searches
+LONGEST_SEARCH = 1_000  # of these from one message to the next; more means a damaged file
 
 
 class SqliteBag:
@@ -28,7 +30,6 @@ class SqliteBag:
         self._lock = threading.Lock()
         try:
             self._connection = _connect(path)
-            definitions = self._definitions()
             rows = self._connection.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
             ).fetchall()
@@ -38,8 +39,7 @@ class SqliteBag:
         numbers: dict[int, str] = {}
         for number, name, kind, encoding in rows:
             if encoding in ("cdr", "") and isinstance(name, str) and isinstance(kind, str):
-                text, language = definitions.get(kind, ("", ""))
-                self.topics[name] = BagTopic(name, kind, False, text, language.endswith("idl"))
+                self.topics[name] = BagTopic(name, kind)
                 numbers[number] = name
         found: dict[str, list[tuple[int, int]]] = {name: [] for name in self.topics}
         for row, number, time in self._rows():
@@ -79,31 +79,31 @@ class SqliteBag:
                 f"{self.path}: message {index} of {topic} is damaged or cut off ({error})"
             ) from error
 
-    def _definitions(self) -> dict[str, tuple[str, str]]:
-        """Type -> its definition and the language of that, where the bag holds them."""
-        try:
-            rows = self._connection.execute(
-                "SELECT topic_type, encoded_message_definition, encoding FROM message_definitions"
-            ).fetchall()
-        except sqlite3.Error:
-            return {}
-        return {row[0]: (row[1], row[2]) for row in rows if all(isinstance(x, str) for x in row)}
-
     def _rows(self) -> Iterator[tuple[int, int, int]]:
         """Row, topic and time of every message; behind a damaged page it goes on where it can."""
-        last, step = -1, 0
+        last, step, work = -1, 0, 0
+
+        def too_much() -> bool:
+            nonlocal work
+            work += 1
+            return work > LONGEST_SEARCH
+
+        self._connection.set_progress_handler(too_much, STEPS)
         query = "SELECT id, topic_id, timestamp FROM messages WHERE id > ?"
         while step < 1 << 20:
             try:
                 for row in self._connection.execute(query, (last + step,)):
-                    last, step = row[0], 0
+                    if row[0] <= last:  # pages that follow each other in a circle
+                        raise sqlite3.DatabaseError
+                    last, step, work = row[0], 0, 0
                     yield row
-                return
+                break
             except sqlite3.Error:
                 self.damage = (
                     f"{self.path}: the recording is cut off or damaged; it is read up to there"
                 )
-                step = max(2 * step, 1)
+                step, work = max(2 * step, 1), 0
+        self._connection.set_progress_handler(None, 0)
 
 
 def _connect(path: Path) -> sqlite3.Connection:
