@@ -16,6 +16,7 @@ from ..errors import InputError
 from ..geometry.gravity import parse_up
 from ..tracking import Mode, TrackingResult, check_poses, make_tracker
 from ..tracking.live import TrackedFrames
+from ..tracking.live import warm_up as warm_up_tracker
 from .color_camera import AUTO, given_color
 from .interrupts import INTERRUPTED, stop_on_signal
 from .options import (
@@ -83,7 +84,9 @@ def reconstruct_live(
         say_what_is_replaced(folder, output, settings, False, source.tracking != "given")
         with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
             watcher = open_watcher(watch, folder.path.name, source.most or 0, stop)
-            warm_up(settings)  # or the first frames would be dropped while kernels are compiled
+            # or the first frames would be dropped while kernels are compiled
+            warm_up(settings)
+            warm_up_tracker(make_tracker(source.tracking, settings.tracking, settings.preprocess))
             try:
                 code = _map(source, recording.strict, output, settings, folder, stop, watcher)
             except BaseException:

@@ -13,14 +13,17 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 
 from ..errors import FrameError, InputError
 from ..geometry.velocities import FRAME_RATE
 from ..types import Frame
-from .dataset import Dataset
+from .dataset import Dataset, DatasetView
 
 CAPACITY = 2  # frames that wait; more would only be older when their turn comes
 LONGEST_WAIT = 0.1  # [s] before asking again whether to stop
+# what a source gives: a frame, why one cannot be used, or a function that returns or raises these
+Item = Frame | FrameError | Callable[[], Frame]
 LONGEST_PAUSE = 5.0  # [s] between two frames of a replay; a longer gap of a recording is cut short
 
 
@@ -52,7 +55,7 @@ class LiveFrames(Arriving):
 
     def __init__(
         self,
-        source: Iterable[Frame | FrameError],
+        source: Iterable[Item],
         name: str,
         *,
         capacity: int = CAPACITY,
@@ -64,7 +67,7 @@ class LiveFrames(Arriving):
         self.name, self.warnings = name, tuple(getattr(source, "warnings", ()))
         self.received = self.dropped = 0
         self._source, self._capacity, self._stop, self._most = source, capacity, stop, most
-        self._waiting: deque[Frame | FrameError] = deque()
+        self._waiting: deque[Item] = deque()
         self._change = threading.Condition()
         self._ended, self._failure = False, None
         self._thread = threading.Thread(target=self._receive, name="live", daemon=True)
@@ -99,7 +102,7 @@ class LiveFrames(Arriving):
             ):  # a generator that is running just now ends with its next frame
                 end()
 
-    def _next(self) -> Frame | FrameError | None:
+    def _next(self) -> Item | None:
         """The oldest frame that waits, None at the end; waits for one."""
         with self._change:
             while not self._waiting:
@@ -138,26 +141,30 @@ class Replay:
     """The frames of a recording at the pace in which they were taken, as a camera gives them.
 
     `speed` 2 is twice as fast. Where a recording has no time stamps, its frames come at 30 Hz. A frame that
-    cannot be read comes as its FrameError.
+    cannot be read comes as its FrameError; one that is rendered, as a function that renders it.
     """
 
     def __init__(self, frames: Dataset, speed: float = 1.0) -> None:
         if not speed > 0:
             raise InputError(f"replay: speed must be positive, got {speed}")
-        if frames.runs_kernels:  # two threads must not launch kernels at once
-            raise InputError(
-                f"{frames.name}: is rendered while it is read, which cannot be played live"
-            )
         self.frames, self.speed, self.warnings = frames, speed, frames.warnings
 
-    def __iter__(self) -> Iterator[Frame | FrameError]:
+    def __iter__(self) -> Iterator[Item]:
+        recording = self.frames
+        while isinstance(recording, DatasetView):
+            recording = recording.dataset
         due, before = time.perf_counter(), None
         for i in range(len(self.frames)):
-            try:
-                item: Frame | FrameError = self.frames[i]
-                stamp = item.timestamp
-            except FrameError as error:
-                item, stamp = error, None
+            item: Item
+            stamp = None
+            if recording.runs_kernels:  # two threads must not launch kernels at once
+                item = partial(self.frames.__getitem__, i)
+            else:
+                try:
+                    item = self.frames[i]
+                    stamp = item.timestamp
+                except FrameError as error:
+                    item = error
             step = 1 / FRAME_RATE
             if stamp is not None:
                 step = 0.0 if before is None else min(max(stamp - before, 0), LONGEST_PAUSE)
@@ -167,7 +174,10 @@ class Replay:
             yield item
 
 
-def _given(item: Frame | FrameError) -> Callable[[], Frame]:
+def _given(item: Item) -> Callable[[], Frame]:
+    if callable(item):
+        return item
+
     def load() -> Frame:
         if isinstance(item, FrameError):
             raise item

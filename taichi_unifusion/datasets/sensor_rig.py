@@ -95,7 +95,7 @@ def poses_beside(
         poses = (Pose("first frame", np.eye(4)), *(Pose(f"no {file.name}") for _ in times[1:]))
         said = (
             f"there is no {file.name} with poses beside {recording.name}: the first frame's "
-            "camera is the world, and the other frames have no pose"
+            "camera is the world, and the other frames have no pose (--tracking rgbd finds them)"
         )
         return poses, (said,) * (len(times) > 1)
     rows = sorted(read_stamped_poses(file), key=lambda row: row.timestamp)

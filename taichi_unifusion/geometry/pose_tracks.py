@@ -26,7 +26,8 @@ class PoseTrack:
         left out, and of equal times the first counts. None where nothing is left.
         """
         rows = np.asarray(rows, np.float64).reshape(-1, 8)
-        length = np.linalg.norm(rows[:, 4:], axis=1)
+        with np.errstate(over="ignore"):  # of numbers that are no quaternions
+            length = np.linalg.norm(rows[:, 4:], axis=1)
         rows = rows[np.isfinite(rows).all(axis=1) & (np.abs(length - 1) < 0.1)]
         times, first = np.unique(rows[:, 0], return_index=True)
         if not len(times):

@@ -5,10 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from ..datasets.live import Arriving
 from ..errors import FrameError, PoseError
-from ..types import Frame
+from ..types import Frame, PinholeCamera
 from .base import Tracker
+
+
+def warm_up(tracker: Tracker) -> None:
+    """Compile what a tracker runs, which takes seconds, by two frames of a wall; it is of no use afterwards."""
+    camera = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5)
+    u, v = np.meshgrid(np.arange(160), np.arange(120))
+    depth = (1.5 + 0.1 * np.sin(u / 15) + 0.1 * np.cos(v / 11)).astype(np.float32)
+    grey = ((u // 12 + v // 9) % 2 * 160 + 40).astype(np.uint8)
+    for i in range(2):
+        tracker.track(Frame(depth, camera, np.dstack([grey] * 3), np.eye(4), i))
 
 
 class TrackedFrames(Arriving):

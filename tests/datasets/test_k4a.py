@@ -112,7 +112,7 @@ def test_frames_have_times_and_the_first_has_a_pose(recording):
     assert len(dataset) == 3 and dataset.sizes["DEPTH"] == scene.DEPTH_SIZE
     assert dataset.warnings == (
         "there is no recording.txt with poses beside recording.mkv: the first frame's camera is the "
-        "world, and the other frames have no pose",
+        "world, and the other frames have no pose (--tracking rgbd finds them)",
     )
     frames = list(dataset)
     np.testing.assert_allclose(

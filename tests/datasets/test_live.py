@@ -138,8 +138,13 @@ def test_a_replay_keeps_the_pace_of_its_recording(speed):
     assert arrived[1][1] >= 0.1 / speed and arrived[3][1] >= 0.4 / speed
     with pytest.raises(InputError, match="speed must be positive"):
         Replay(Recorded([]), 0)
-    with pytest.raises(InputError, match="is rendered while it is read"):
-        Replay(uf.open_dataset("synthetic"))
+
+
+def test_a_recording_that_is_rendered_is_so_where_frames_are_taken():
+    room = uf.open_dataset("synthetic", frames=4, width=32, height=24)
+    frames = list(LiveFrames(Replay(room[::2], 100), "room", capacity=9))
+    assert [each.index for each in frames] == [0, 2]
+    np.testing.assert_array_equal(frames[1].depth, room[2].depth)
 
 
 def test_a_map_from_live_frames_is_that_of_the_recording():
