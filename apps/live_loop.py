@@ -18,7 +18,7 @@ from taichi_unifusion.viewer.window_live import watch_in_window
 def main(out: str, format: str = "", path: str = "") -> None:
     pipeline = uf.Pipeline(uf.Config())
     uf.warm_up()  # compile first, so that no frame is missed meanwhile
-    source = Replay(uf.open_dataset(format, path)) if format else RealsenseCamera()
+    source = Replay(uf.open_dataset(format, path).without_poses()) if format else RealsenseCamera()
     watcher = watch_in_window(out, 0)  # where there is a screen
     with LiveFrames(source, path or "camera") as frames:
         run = pipeline.run(

@@ -116,6 +116,8 @@ def open_source(asked: RecordingOptions, mode: Mode, speed: float) -> LiveSource
     if mode not in ("given", "rgbd"):
         raise InputError(f"--live: poses are given or found by rgbd, not by --tracking {mode}")
     check_poses(recording, mode)
+    if mode == "rgbd":
+        recording = recording.without_poses()
     recording, known = given_color(recording, asked.color_camera)
     frames = recording[:: asked.every]
     record = source_of(asked, len(frames), None if asked.color_camera == AUTO else known)

@@ -39,8 +39,6 @@ def check_scene(frame, align: str) -> None:
 @pytest.mark.parametrize("container", ["bag", "db3"])
 @pytest.mark.parametrize("inverse", [False, True])
 def test_depth_and_colour_are_registered(container, align, inverse, tmp_path):
-    if inverse and container == "bag":
-        pytest.skip("CameraInfo of the older files names no model")
     dataset = open_dataset(
         "realsense", write_realsense(tmp_path / "r", container, inverse=inverse), align=align
     )
