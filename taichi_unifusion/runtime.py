@@ -15,6 +15,7 @@ import platform
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -45,6 +46,12 @@ DEVICES = ("auto", "cuda", "cpu")
 STALE_LOCK = 60  # [s] Taichi locks its cache of compiled kernels for a second or two
 MAX_TREES = 12
 PROBE_SECONDS = 20.0  # a driver that has not answered by then is taken for broken
+FORKED = """Taichi was started before this process was forked and does not run here: start processes by \
+multiprocessing.get_context('spawn'), or fork before uf.init"""
+OTHER_THREAD = """maps are used by the thread that started Taichi alone: do all work with maps there, and hand \
+it frames and questions through a queue.Queue"""
+STARTED_AGAIN = """Taichi was started again by other code (ti.init), and the memory of all maps is gone: use \
+ti.init only before the first map, or start a new process"""
 GIB = 1 << 30
 # CUDA's pool for sparse voxels: this share of the GPU's memory within limits, and where that is not known
 POOL_SHARE, POOL_LIMITS, POOL_UNKNOWN = 0.25, (1 * GIB, 8 * GIB), 2 * GIB
@@ -118,6 +125,8 @@ class Runtime:
 
     def __init__(self, device: str, description: str, sparse_pool: int = 0) -> None:
         self.device, self.description, self.sparse_pool = device, description, sparse_pool
+        self._program = import_taichi().lang.impl.get_runtime().prog  # ti.init makes another one
+        self._home = os.getpid(), threading.get_ident()
         self.arena = Arena()
         self.warm = (
             False  # whether a pipeline has begun with a frame, for which kernels are compiled
@@ -131,6 +140,18 @@ class Runtime:
         # the index tree of the map that was made last, and by tree which ones came after it
         self.last_tree: Any = None
         self.followers: defaultdict[Any, set[Any]] = defaultdict(set)
+
+    def check_here(self) -> None:
+        """Raise RuntimeStateError where Taichi would crash or hang: in a forked process, in another
+        thread than the one that started it, and after somebody else has started it again.
+        """
+        pid, thread = self._home
+        if pid != os.getpid():
+            raise RuntimeStateError(FORKED)
+        if thread != threading.get_ident():
+            raise RuntimeStateError(OTHER_THREAD)
+        if self._program is not sys.modules["taichi"].lang.impl.get_runtime().prog:
+            raise RuntimeStateError(STARTED_AGAIN)
 
     def count_tree(self) -> None:
         """Note that one more index tree is made; raises CapacityError before there are more than
@@ -165,7 +186,7 @@ def init(
     check_choice("device", device, DEVICES)
     if _runtime is not None:
         if device in ("auto", _runtime.device):
-            return _runtime
+            return current()
         raise RuntimeStateError(
             f"device: Taichi already runs on {_runtime.device}; start a new process to use {device}"
         )
@@ -208,13 +229,18 @@ def init(
 
 
 def current() -> Runtime:
-    """The live runtime; starts one with the defaults if there is none."""
-    return _runtime or init()
+    """The live runtime, one with the defaults if there was none; raises RuntimeStateError."""
+    if _runtime is None:
+        return init()
+    _runtime.check_here()
+    return _runtime
 
 
 def check_alive(runtime: Runtime) -> None:
-    """Raise RuntimeStateError unless `runtime` is the live one."""
-    if runtime is not _runtime:
+    """Raise RuntimeStateError unless `runtime` is the live one, and can be used here and now."""
+    if runtime is _runtime:
+        runtime.check_here()
+    else:
         raise RuntimeStateError(
             "this map was made before Taichi was started again and its memory is gone; save maps first, "
             "then load them in the new process"

@@ -6,7 +6,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Generic, NoReturn, Protocol, Self, TypeVar
 
 from ..errors import InputError, MapCorrupt
 from ..files.maps import write_map
@@ -49,6 +49,22 @@ class BaseMap(ABC, Generic[S]):
         self.name, self.channels, self.settings = name, channels, settings
         self.grid = grid
         self.waiting: Unfused | None = None
+
+    def __copy__(self) -> Self:
+        """An independent map of the same voxels, bit for bit."""
+        self.flush()
+        made = self._empty(self.name, self.channels, self.settings)
+        made.grid.add(self.grid.export())
+        return made
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self.__copy__()
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        raise InputError(
+            f"map '{self.name}': a map lives on the device and cannot be pickled: save it with "
+            "map.save(FILE), and read it with load_map(FILE) where it is needed"
+        )
 
     def flush(self) -> None:
         """Fuse the frames that a pipeline has summed up for this map, if there are any."""

@@ -287,6 +287,7 @@ class VoxelGrid:
     @property
     def memory_bytes(self) -> int:
         """Bytes that the voxels need: pools as far as they are used, and the index tree."""
+        runtime.check_alive(self.runtime)
         leaves = int(kernels.count_leaves(self.index)) if self.count else 0
         return self.count * self.row_bytes + leaves * BYTES_PER_LEAF
 
