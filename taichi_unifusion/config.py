@@ -14,7 +14,15 @@ from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 import yaml
 
-from .errors import ConfigError, InputError, check_choice, convert, did_you_mean, shortened
+from .errors import (
+    ConfigError,
+    InputError,
+    check_choice,
+    check_range,
+    convert,
+    did_you_mean,
+    shortened,
+)
 from .files.strict_yaml import read_yaml
 from .maps.detail import ROOM, Detail, choose_voxel_size, sight_of
 from .maps.settings import (
@@ -33,6 +41,8 @@ from .types import Frame
 
 S = TypeVar("S", bound=MapSettings)
 
+MAX_THREADS = 4096  # of a CPU
+
 
 @dataclass(frozen=True)
 class MeshSettings:
@@ -49,9 +59,11 @@ class MeshSettings:
     """
 
     def __post_init__(self) -> None:
-        if not 1 <= self.resolution <= MAX_RESOLUTION:
+        check_range("resolution", self.resolution, 1, MAX_RESOLUTION, "cells a voxel")
+        check_range("min_area", self.min_area, 0, 1e6, "square metres")
+        if not self.formats or len(set(self.formats)) < len(self.formats):
             raise InputError(
-                f"resolution: must lie in 1..{MAX_RESOLUTION} cells a voxel, got {self.resolution}"
+                f"formats: must name one or more of ply, glb and obj, each once, got {self.formats}"
             )
 
 
@@ -121,8 +133,7 @@ class Config:
     def __post_init__(self) -> None:
         check_choice("detail", self.detail, get_args(Detail))
         check_voxel_size(self.voxel_size)
-        if self.threads < 0:
-            raise InputError(f"threads: must not be negative, got {self.threads}")
+        check_range("threads", self.threads, 0, MAX_THREADS)
         if not 1 <= self.window <= MAX_WINDOW:
             raise InputError(f"window: must lie in 1..{MAX_WINDOW} frames, got {self.window}")
         if self.map_memory:

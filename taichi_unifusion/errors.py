@@ -16,6 +16,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, SupportsFloat, Union, get_args, get_origin
 
+_CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 _LARGEST_INTEGER = 2**63  # what NumPy and files can hold
 _KINDS = {
     float: "a number",
@@ -166,6 +167,13 @@ def shortened(value: object) -> str:
         return reprlib.repr(value)
     except ValueError:  # a whole number of more digits than Python prints
         return type(value).__name__
+
+
+def plain_text(text: str) -> str:
+    """Text in which control characters, which may come from a file's name and could steer a
+    terminal, are written as \\x1b; lines and tabs stay.
+    """
+    return _CONTROLS.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
 
 
 def _convert_tuple(value: object, types: tuple[Any, ...], name: str) -> tuple[Any, ...]:

@@ -191,6 +191,10 @@ class Frame:
         return replace(self, features={**self.features, name: image})
 
 
+# of a squared normal: half precision and rounding in files stay below it
+UNIT_TOLERANCE = 0.02
+
+
 @dataclass(frozen=True)
 class PointCloud:
     """Points with unit normals towards the camera and any sampled properties, all in one frame of
@@ -237,6 +241,7 @@ class PointCloud:
         )
         if self.normals is not None:
             object.__setattr__(self, "normals", np.ascontiguousarray(self.normals))
+            self._check_unit_normals()
         if self.counts is not None:
             if self.counts.shape != (len(self.points),) or self.counts.dtype != np.int32:
                 raise InputError(
@@ -251,6 +256,20 @@ class PointCloud:
                 "point cloud: its view must be a depth image (H, W) of finite numbers, 0 where "
                 "there is no reading"
             )
+
+    def _check_unit_normals(self) -> None:
+        """Raise InputError for normals of another length than 1; those that are not finite are left
+        out later.
+        """
+        squares = np.einsum("ij,ij->i", self.normals, self.normals)
+        off = np.abs(squares - 1)
+        if (off > UNIT_TOLERANCE).any():  # False for NaN
+            worst = int(np.nanargmax(off))
+            if np.isfinite(squares[worst]):
+                raise InputError(
+                    f"point cloud: normals must have unit length, that of point {worst} has "
+                    f"{np.sqrt(squares[worst]):.3g}: divide them by their length"
+                )
 
     def __len__(self) -> int:
         return len(self.points)

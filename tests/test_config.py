@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from pathlib import Path
 
 import pytest
@@ -84,7 +85,7 @@ def test_a_number_with_an_exponent_is_a_number(tmp_path):
         ("mesh: {formats: [ply, stl]}", ["mesh.formats[1]: 'stl' is unknown", "ply, glb, obj"]),
         ("surface: {voxel_size: -1}", ["in surface: voxel_size", "-1"]),
         ("mesh: {resolution: 99}", ["in mesh: resolution", "99"]),
-        ("threads: -1", ["threads: must not be negative"]),
+        ("threads: -1", ["threads: must lie in 0..4096, got -1"]),
     ],
 )
 def test_I5_what_does_not_fit_is_named_by_its_path(tmp_path, text, told):
@@ -183,3 +184,31 @@ def test_paper_settings_are_those_published():
     )
     for settings in (config.surface, config.color):
         assert (settings.noise, settings.encoder.rank, settings.encoder.anchors) == (0.01, 20, 256)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("mesh: {min_area: .nan}", "min_area"),
+        ("mesh: {min_area: -5}", "min_area: must lie in 0"),
+        ("mesh: {formats: [ply, ply]}", "each once"),
+        ("mesh: {formats: []}", "one or more"),
+        ("surface: {encoder: {rank: 1000000000}}", "rank"),
+        ("surface: {encoder: {anchors: 1000000000}}", "anchors"),
+        ("surface: {encoder: {seed: -1}}", "seed"),
+        ("surface: {encoder: {length_scale: .nan}}", "length_scale"),
+        ("threads: " + "9" * 4000, "threads"),
+        ("threads: 99999", "threads: must lie in 0..4096"),
+        ("[" * 20_000, "nested values"),
+        ("a: &a {b: 1}\nc: {<<: [*a, *a]}", "aliases"),
+        ("a: 1\n" * 100_000, "more than the 65536"),
+    ],
+)
+def test_c11_settings_that_cannot_be_are_refused_when_they_are_read(tmp_path, text, told):
+    """I5 too: bombs of YAML, sizes, numbers without end."""
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    start = time.perf_counter()
+    with pytest.raises(ConfigError, match=told):
+        load_config(path)
+    assert time.perf_counter() - start < 2

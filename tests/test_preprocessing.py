@@ -113,6 +113,7 @@ def test_transform_equals_its_twin():
     T[:3, :3], T[:3, 3] = np.linalg.qr(rng.normal(size=(3, 3)))[0], (1, -2, 3)
     T[:3, :3] *= np.sign(np.linalg.det(T[:3, :3]))
     points, normals = rng.normal(size=(2, 50, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     moved = np.empty_like(points)
     kernels.transform(points, T[:3], moved)
     np.testing.assert_allclose(moved, reference.transform(points, T), atol=3 * UNIT)

@@ -51,11 +51,12 @@ def test_shrunk_cuts_off_what_fills_no_block():
 def test_a_cloud_takes_what_belongs_to_its_points():
     points = np.arange(12, dtype=np.float32).reshape(4, 3)
     view = ImageView(np.ones((48, 65), np.float32), CAMERA)
-    cloud = PointCloud(points, -points, {"heat": points[:, :1]}, view, {"clip": view})
+    normals = -points / np.linalg.norm(points, axis=1, keepdims=True)
+    cloud = PointCloud(points, normals, {"heat": points[:, :1]}, view, {"clip": view})
     for rows in (np.array([3, 1]), np.array([False, True, False, True])):
         taken, wanted = cloud.take(rows), points[rows]
         np.testing.assert_array_equal(taken.points, wanted)
-        np.testing.assert_array_equal(taken.normals, -wanted)
+        np.testing.assert_array_equal(taken.normals, normals[rows])
         np.testing.assert_array_equal(taken.attributes["heat"], wanted[:, :1])
         assert taken.view is view and taken.features["clip"] is view
     assert len(replace(cloud, normals=None).take(np.array([0]))) == 1
@@ -100,3 +101,16 @@ def test_a_part_of_a_mesh_has_its_faces_and_the_vertices_of_these():
         np.testing.assert_array_equal(mine, whole[rows])
     nothing, _ = mesh.part(np.zeros(len(mesh.faces), bool))
     assert nothing.vertices.shape == nothing.faces.shape == (0, 3)
+
+
+def test_c17_normals_of_another_length_are_refused():
+    points, up = np.zeros((3, 3), np.float32), np.float32([[0, 0, 1]] * 3)
+    assert PointCloud(points, up).normals is not None
+    assert PointCloud(points, np.float32(up.astype(np.float16) * 1.001)).normals is not None
+    for factor in (5, 0.5, 0):
+        normals = up.copy()
+        normals[1] *= factor
+        with pytest.raises(InputError, match=f"unit length, that of point 1 has {factor}"):
+            PointCloud(points, normals)
+    up[2] = np.nan  # a point without a normal: it is left out when it is fused
+    assert len(PointCloud(points, up)) == 3

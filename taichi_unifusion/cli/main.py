@@ -14,6 +14,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from functools import reduce
 from operator import or_
 from typing import Annotated, Any
@@ -37,7 +38,7 @@ from .query import Query, query
 from .reconstruct import Reconstruct, reconstruct
 from .render import Render, render
 from .segment import Segment, segment
-from .terminal import DONE, FAILED, log_to_stderr, report
+from .terminal import DONE, FAILED, PlainOutput, log_to_stderr, report
 from .transfer import Transfer, transfer
 from .understand import Understand, understand
 from .view import View, view
@@ -79,7 +80,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     with log_to_stderr(debug):
         try:
             code = _dispatch(argv)
-            sys.stdout.flush()
+            if sys.stdout is not None:
+                sys.stdout.flush()
             return code
         except SystemExit as exit:  # from tyro, which has printed help or what is wrong
             return exit.code if isinstance(exit.code, int) else FAILED
@@ -123,7 +125,9 @@ def _run(prog: str, description: str, commands: Commands, argv: list[str]) -> in
     options, command = commands[name]
     if isinstance(command, dict):
         return _run(f"{prog} {name}", inspect.getdoc(options) or "", command, arguments)
-    return command(_parse(f"{prog} {name}", options, arguments))
+    parsed = _parse(f"{prog} {name}", options, arguments)
+    with redirect_stdout(PlainOutput(sys.stdout)):
+        return command(parsed)
 
 
 def _say_commands(prog: str, description: str, commands: Commands, arguments: list[str]) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TextIO
 
-from ..errors import UniFusionError
+from ..errors import UniFusionError, plain_text
 
 DONE, BUG, FAILED = 0, 1, 2  # exit codes
 LINE_INTERVAL = 10.0  # [s] between progress lines where there is no bar
@@ -26,14 +27,40 @@ class StderrHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         label = {logging.WARNING: "warning: ", logging.ERROR: "error: "}.get(record.levelno, "")
-        text = f"unifusion: {label}{record.getMessage()}"
+        message = plain_text(record.getMessage())
+        if label:  # one sentence, whatever names of files hold
+            message = message.replace("\n", "\\n")
+        text = f"unifusion: {label}{message}"
         if record.exc_info:
             text += "\n" + logging.Formatter().formatException(record.exc_info)
         if self.write_above_bar:
             self.write_above_bar(text)
-        else:
+        elif sys.stderr is not None:  # None where it was closed
             sys.stderr.write(text + "\n")
             sys.stderr.flush()
+
+
+class PlainOutput(io.TextIOBase):
+    """Standard output for what commands print: names from files cannot steer the terminal, and
+    letters that it lacks are escaped. Nothing is written where it was closed.
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        if self.stream is not None:
+            encoding = getattr(self.stream, "encoding", None) or "utf-8"
+            written = plain_text(text).encode(encoding, "backslashreplace").decode(encoding)
+            self.stream.write(written)
+        return len(text)
+
+    def flush(self) -> None:
+        if self.stream is not None:
+            self.stream.flush()
+
+    def isatty(self) -> bool:
+        return self.stream is not None and self.stream.isatty()
 
 
 @contextmanager

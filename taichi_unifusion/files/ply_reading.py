@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -95,8 +96,16 @@ def parse_ply(data: bytes, name: str) -> Mesh:
     vertices, normals, values = _vertex_data(
         tables.get("vertex", _Columns()).numbers, attributes, color_range, name
     )
-    polygons = lists.get("vertex_indices", lists.get("vertex_index", []))
+    polygons = lists.get("vertex_indices", lists.get("vertex_index", np.empty((0, 3))))
     return Mesh(vertices, _triangles(polygons, len(vertices), name), normals, values)
+
+
+@dataclass(frozen=True)
+class Uneven:
+    """Lists of several lengths: rows (M,) and their items (M, length), for each length."""
+
+    count: int  # of all rows
+    groups: list[tuple[NDArray[np.int64], NDArray]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -105,8 +114,8 @@ class _Columns:
     long).
     """
 
-    numbers: dict[str, NDArray] = field(default_factory=dict)
-    lists: dict[str, NDArray | list[NDArray]] = field(default_factory=dict)
+    numbers: Mapping[str, NDArray] = field(default_factory=dict)
+    lists: Mapping[str, NDArray | Uneven] = field(default_factory=dict)
 
 
 def _parse_header(data: bytes, name: str) -> tuple[str, list[_Element], dict[str, int], int]:
@@ -156,18 +165,9 @@ def _parse_property(words: list[str]) -> _Property | None:
     return None
 
 
-def _read_element(
-    body: bytes, offset: int, element: _Element, order: str, name: str
-) -> tuple[_Columns, int]:
-    """The columns of one element and where the next element starts."""
-    numbers = [p.name for p in element.properties if not p.count]
-    lists = [p.name for p in element.properties if p.count]
-    if not element.properties or not element.rows:
-        return _Columns({key: np.empty(0) for key in numbers}), offset
-    lengths = {
-        p.name: len(values) for p, values, _ in _read_row(body, offset, element, order, name)
-    }
-    row = np.dtype(
+def _row_type(element: _Element, order: str, lengths: Mapping[str, int]) -> np.dtype[Any]:
+    """The type of a row whose lists, by name, are so long; their lengths are named #list."""
+    return np.dtype(
         [
             item
             for p in element.properties
@@ -178,6 +178,19 @@ def _read_element(
             )
         ]
     )
+
+
+def _read_element(
+    body: bytes, offset: int, element: _Element, order: str, name: str
+) -> tuple[_Columns, int]:
+    """The columns of one element and where the next element starts."""
+    numbers = [p.name for p in element.properties if not p.count]
+    lists = [p.name for p in element.properties if p.count]
+    if not element.properties or not element.rows:
+        return _Columns({key: np.empty(0) for key in numbers}), offset
+    reader = _RowReader(element, order, name)
+    lengths = dict(zip(lists, reader.read(body, offset)[0], strict=True))
+    start, row = offset, _row_type(element, order, lengths)
     table = np.frombuffer(
         body, row, min(element.rows, (len(body) - offset) // row.itemsize), offset
     )
@@ -191,40 +204,72 @@ def _read_element(
         return _Columns(
             {key: table[key] for key in numbers}, {key: table[key] for key in lists}
         ), offset
-    values_of = {key: list(table[key]) if key in lists else [table[key]] for key in numbers + lists}
-    # from the first row of other lengths, or at the end of the file, row by row
-    for _ in range(len(table), element.rows):
-        row_values = list(_read_row(body, offset, element, order, name))
-        for p, values, _ in row_values:
-            values_of[p.name].append(values)
-        offset = row_values[-1][2]
-    return _Columns(
-        {k: np.concatenate(values_of[k]) for k in numbers}, {k: values_of[k] for k in lists}
-    ), offset
+    return _read_uneven(body, start, element, order, name)
 
 
-def _read_row(
+def _read_uneven(
     body: bytes, offset: int, element: _Element, order: str, name: str
-) -> Iterator[tuple[_Property, NDArray, int]]:
-    """The values of each property of the row at `offset`, and where they end."""
-    for p in element.properties:
-        length = 1
-        if p.count:
-            kind = np.dtype(order + p.count)
-            if offset + kind.itemsize > len(body):
-                raise _truncated(name, element)
-            length = float(np.frombuffer(body, kind, 1, offset)[0])
-            offset += kind.itemsize
+) -> tuple[_Columns, int]:
+    """As `_read_element`, where lists differ in length: rows of equal lengths are read together."""
+    groups: dict[tuple[int, ...], tuple[list[int], list[int]]] = {}  # lengths -> rows, offsets
+    reader = _RowReader(element, order, name)
+    for n in range(element.rows):
+        lengths, end = reader.read(body, offset)
+        rows, offsets = groups.setdefault(lengths, ([], []))
+        rows.append(n)
+        offsets.append(offset)
+        offset = end
+    data = np.frombuffer(body, np.uint8)
+    numbers = {
+        p.name: np.empty(element.rows, order + p.kind) for p in element.properties if not p.count
+    }
+    lists = {p.name: Uneven(element.rows) for p in element.properties if p.count}
+    for lengths, (rows, offsets) in groups.items():
+        row = _row_type(element, order, dict(zip(lists, lengths, strict=True)))
+        places = np.array(offsets)[:, None] + np.arange(row.itemsize)
+        table = data[places].reshape(-1).view(row)
+        for key, values in numbers.items():
+            values[rows] = table[key]
+        for key, values in lists.items():
+            values.groups.append((np.array(rows), table[key].reshape(len(rows), -1)))
+    return _Columns(numbers, lists), offset
+
+
+class _RowReader:
+    """Finds how long the lists of a row are, and where the row ends."""
+
+    def __init__(self, element: _Element, order: str, name: str) -> None:
+        self.element, self.name = element, name
+        # for each list the bytes before its length, how that is packed, and the bytes of an item
+        self.steps: list[tuple[int, struct.Struct, int]] = []
+        self.tail = 0  # bytes after the last list
+        for p in element.properties:
+            size = np.dtype(p.kind).itemsize
+            if p.count:
+                count = struct.Struct(order + np.dtype(p.count).char)
+                self.steps.append((self.tail, count, size))
+                self.tail = 0
+            else:
+                self.tail += size
+
+    def read(self, body: bytes, at: int) -> tuple[tuple[int, ...], int]:
+        """The lengths of the lists of the row at `at`, and its end; raises FileError."""
+        lengths = []
+        for before, count, size in self.steps:
+            at += before
+            if at + count.size > len(body):
+                raise _truncated(self.name, self.element)
+            (length,) = count.unpack_from(body, at)
             if not 0 <= length < 1 << 31 or length % 1:
                 raise FileError(
-                    f"{name}: a list in element '{element.name}' of the PLY file has length {length:g}"
+                    f"{self.name}: a list in element '{self.element.name}' of the PLY file has length "
+                    f"{length:g}"
                 )
-        kind = np.dtype(order + p.kind)
-        if offset + int(length) * kind.itemsize > len(body):
-            raise _truncated(name, element)
-        values = np.frombuffer(body, kind, int(length), offset)
-        offset += values.nbytes
-        yield p, values, offset
+            lengths.append(int(length))
+            at += count.size + int(length) * size
+        if at + self.tail > len(body):
+            raise _truncated(self.name, self.element)
+        return tuple(lengths), at + self.tail
 
 
 def _truncated(name: str, element: _Element) -> FileError:
@@ -266,22 +311,17 @@ def _vertex_data(
     return vertices, normals, values | {key: taken(key) for key in list(rest)}
 
 
-def _triangles(
-    polygons: NDArray[Any] | list[NDArray[Any]], count: int, name: str
-) -> NDArray[np.int32]:
+def _triangles(polygons: NDArray[Any] | Uneven, count: int, name: str) -> NDArray[np.int32]:
     """Faces (F, 3) of polygons, which index `count` vertices; a polygon of k corners is a fan of k
     - 2 triangles.
     """
-    if isinstance(polygons, list):
-        fans = [
-            np.stack([np.full(len(p) - 2, p[0]), p[1:-1], p[2:]], axis=1)
-            for p in polygons
-            if len(p) > 2
-        ]
-        corners = np.concatenate(fans) if fans else np.empty((0, 3))
+    if isinstance(polygons, Uneven):
+        fans = [(rows, _fans(items)) for rows, items in polygons.groups]
+        owners = np.concatenate([np.repeat(rows, fan.shape[1]) for rows, fan in fans])
+        corners = np.concatenate([fan.reshape(-1, 3) for _, fan in fans])
+        corners = corners[np.argsort(owners, kind="stable")]  # in the file's order
     else:
-        first = np.repeat(polygons[:, :1], max(polygons.shape[1] - 2, 0), axis=1)
-        corners = np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3)
+        corners = _fans(polygons).reshape(-1, 3)
     if len(corners) and not (corners.min() >= 0 and corners.max() < count):
         raise FileError(f"{name}: a face of the PLY file names a vertex outside 0..{count - 1}")
     faces = corners.astype(np.int32)
@@ -290,3 +330,9 @@ def _triangles(
             f"{name}: a face of the PLY file names a vertex by a number that is not whole"
         )
     return faces
+
+
+def _fans(polygons: NDArray[Any]) -> NDArray[Any]:
+    """Triangles (F, k - 2, 3) of polygons (F, k)."""
+    first = np.repeat(polygons[:, :1], max(polygons.shape[1] - 2, 0), axis=1)
+    return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2)

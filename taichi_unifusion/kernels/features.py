@@ -28,6 +28,7 @@ from .tasks import worker_stride
 
 # cells of a doubled voxel, 512 at most; not a power of two: rows would map to the same cache sets
 ENTRIES = 528
+LOW = 0xFFFFFFFF  # the low half of 64 bits
 CHANNELS = 16  # channels that a worker sums at once
 LEVELS = 127  # of the largest number of a row in 8 bits
 
@@ -212,10 +213,16 @@ def fuse_moments(
 
 
 @ti.func
+def product(a: ti.u32, b: ti.template()) -> ti.u32:
+    """a b modulo 2^32; debug mode would report a product of 32 bits that wraps around."""
+    return ti.cast((ti.cast(a, ti.u64) * ti.u64(b)) & ti.u64(LOW), ti.u32)
+
+
+@ti.func
 def chance(seed: ti.u32, i: ti.i32) -> ti.f32:
     """A number in [0, 1) for the i-th number of a voxel."""
-    h = (seed + ti.cast(i, ti.u32)) * ti.u32(0x9E3779B1)
-    h = (h ^ (h >> 15)) * ti.u32(0x85EBCA77)
+    h = product(ti.cast((ti.cast(seed, ti.u64) + ti.cast(i, ti.u64)) & ti.u64(LOW), ti.u32), 0x9E3779B1)
+    h = product(h ^ (h >> 15), 0x85EBCA77)
     h = h ^ (h >> 13)
     return ti.cast(h >> 8, ti.f32) * (1.0 / (1 << 24))
 
@@ -270,7 +277,7 @@ def voxel_seed(ijk: ti.template(), weight: ti.f32) -> ti.u32:
     """Seed of the stochastic rounding; differs between voxels and between updates of a voxel."""
     h = ti.bit_cast(weight, ti.u32)
     for d in ti.static(range(3)):
-        h = (h ^ ti.cast(ijk[d], ti.u32)) * ti.u32(0x01000193)
+        h = product(h ^ ti.cast(ijk[d], ti.u32), 0x01000193)
         h ^= h >> 16
     return h
 

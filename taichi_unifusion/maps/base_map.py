@@ -107,7 +107,12 @@ class BaseMap(ABC, Generic[S]):
         """
 
     def merge(self, other: Self) -> None:
-        """Fuse another map of the same settings into this one (Eq. 19 is associative).
+        """Fuse another map of the same settings into this one.
+
+        Latents and weights are those of one map of all frames, up to rounding (Eq. 19 is associative).
+        Evidence of a surface map, which cuts its mesh with `carve`, is added too, but rays voted on
+        the surface as it was then: the mesh may differ in a few per mille of its vertices, as it does
+        when frames come in another order.
 
         Raises InputError where they differ.
         """

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..errors import InputError
+from ..errors import InputError, check_range
 from ..kernels import visibility
 from ..kernels.cells import CELLS
 from ..kernels.patches import Patches, Values
@@ -185,11 +185,8 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         if flush:
             self.flush()
         runtime.check_alive(self.grid.runtime)
-        if not 1 <= resolution <= MAX_RESOLUTION:
-            raise InputError(
-                f"extract_mesh: resolution must lie in 1..{MAX_RESOLUTION} cells a voxel, got "
-                f"{resolution}"
-            )
+        check_range("extract_mesh: resolution", resolution, 1, MAX_RESOLUTION, "cells a voxel")
+        check_range("extract_mesh: min_area", min_area, 0, 1e6, "square metres")
         if blocks is not None and min_area > 0:
             raise InputError(
                 "extract_mesh: min_area needs the whole mesh, since blocks cut parts in pieces: leave "

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import struct
+import time
 
 import numpy as np
 import pytest
@@ -252,3 +254,33 @@ def test_obj_keeps_order_colors_and_normals(tmp_path, mesh):
 def test_empty_mesh_is_written_as_ply_only(tmp_path, mesh, suffix):
     with pytest.raises(InputError, match="empty.*write a .ply"):
         write_mesh(tmp_path / f"a{suffix}", Mesh(mesh.vertices[:0], mesh.faces[:0]))
+
+
+def test_c15_polygons_of_several_sizes_are_read_fast_and_in_order(tmp_path):
+    """A million faces took a minute, one Python step each."""
+    rng = np.random.default_rng(0)
+    count, sizes = 200_000, rng.choice([3, 4, 5, 0, 2], 200_000)
+    corners = [rng.integers(0, 9, size) for size in sizes]
+    header = f"""ply
+format binary_little_endian 1.0
+element vertex 9
+property float x
+property float y
+property float z
+element face {count}
+property uchar flag
+property list uchar int vertex_indices
+property float area
+end_header
+"""
+    rows = b"".join(struct.pack(f"<BB{len(c)}if", 7, len(c), *c.tolist(), 0.5) for c in corners)
+    path = tmp_path / "mixed.ply"
+    path.write_bytes(header.encode() + np.arange(27, dtype="<f4").tobytes() + rows)
+    start = time.perf_counter()
+    faces = read_mesh(path).faces
+    assert time.perf_counter() - start < 4
+    fans = [(c[0], c[i], c[i + 1]) for c in corners for i in range(1, len(c) - 1)]
+    assert np.array_equal(faces, np.array(fans))
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(FileError, match="truncated"):
+        read_mesh(path)

@@ -11,8 +11,9 @@ import pytest
 from map_kinds import KINDS, SMALL, answers, content, frames, integrated
 from places import DEVICE
 from scenes import cloud_of, moved, rough, taken
+from tiny_recording import make_frames
 
-from taichi_unifusion import PropertyMap, load_map, runtime
+from taichi_unifusion import PropertyMap, SurfaceMap, load_map, preprocess, runtime
 from taichi_unifusion.errors import (
     CapacityError,
     InputError,
@@ -280,3 +281,26 @@ def test_a_map_of_another_runtime_is_refused(fused, monkeypatch, tmp_path):
     ):
         with pytest.raises(RuntimeStateError, match="save maps first"):
             use()
+
+
+# of vertices, between orders of frames: rays vote on the surface as it is when they come (measured 0.2 %)
+ORDER_TOLERANCE = 0.01
+
+
+def test_c18_order_and_merging_change_the_cut_of_a_surface_by_little():
+    """N3: latents and weights are those of any order; evidence, and what it cuts, nearly."""
+    seen = make_frames(6)
+    clouds = [preprocess(frame).transformed(frame.T_world_camera) for frame in seen]
+    settings = {"voxel_size": 0.1, "support_points": 1}
+    one, other, merged, rest = (SurfaceMap(**settings) for _ in range(4))
+    integrated(one, clouds)
+    integrated(other, [clouds[i] for i in (3, 5, 0, 2, 4, 1)])
+    integrated(merged, clouds[:3])
+    merged.merge(integrated(rest, clouds[3:]))
+    expected, vertices = one.voxels(), len(one.extract_mesh().vertices)
+    for each in (other, merged):
+        data = each.voxels()
+        assert np.array_equal(data.keys, expected.keys)
+        assert np.array_equal(data.weights, expected.weights)
+        assert np.abs(data.latents - expected.latents).max() < 1e-4
+        assert abs(len(each.extract_mesh().vertices) / vertices - 1) < ORDER_TOLERANCE
