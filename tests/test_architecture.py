@@ -28,7 +28,7 @@ FLOORS = [
     {"properties"},
     {"pipeline"},
     {"results"},
-    {"viewer"},
+    {"viewer", "cluster"},
     {"cli"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}

@@ -10,14 +10,14 @@ import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, MapCorrupt, convert, shortened
-from .atomic import check_writable, read_bytes, write_text
+from .atomic import check_writable, file_error, read_bytes, write_text
 from .maps import read_map, write_map
 
 INDEX = "index.json"
@@ -137,6 +137,20 @@ class TileFolder:
             raise
         self._turn += 1
         _remove(replaced)
+
+    def adopt(self, other: TileFolder) -> None:
+        """Move the tiles of another folder here, in place of those that are there; raises FileError."""
+        replaced = [self.path / self.tiles[tile].file for tile in other.tiles if tile in self.tiles]
+        try:
+            for tile, each in other.tiles.items():
+                name = f"{'_'.join(map(str, tile))}.{self._turn}.safetensors"
+                os.replace(other.path / each.file, self.path / name)
+                self.tiles[tile] = replace(each, file=name)
+        except OSError as error:
+            raise file_error("write", self.path, error) from error
+        self._turn += 1
+        self._write_index()
+        _remove([*replaced, other.index])
 
     def _write_index(self) -> None:
         tiles = [{"tile": tile, **asdict(each)} for tile, each in sorted(self.tiles.items())]

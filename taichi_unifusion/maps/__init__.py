@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .property_group import PropertyGroup
     from .property_map import PropertyMap
     from .settings import FeatureSettings, MapSettings, PropertySettings, SurfaceSettings
+    from .stored import MapDescription
     from .surface_map import SurfaceMap
 
 __all__ = [
@@ -47,9 +48,15 @@ def load_map(path: str | Path) -> BaseMap:
     from .stored import read_stored
 
     description, data = read_stored(Path(path))
+    made = empty_map(description)
+    made.grid.add(data)
+    return made
+
+
+def empty_map(description: MapDescription) -> BaseMap:
+    """A map as a file describes it, without voxels."""
     module, name = MAP_KINDS[description.kind]
-    kind = getattr(import_module(f".{module}", __name__), name)
-    return kind.restored(description, data)
+    return getattr(import_module(f".{module}", __name__), name).empty(description)
 
 
 __getattr__, __dir__, _ = lazy_loader.attach(

@@ -160,9 +160,14 @@ class BaseMap(ABC, Generic[S]):
     @classmethod
     def restored(cls, description: MapDescription, data: VoxelData) -> Self:
         """The map that a file of this kind holds."""
-        made = cls._empty(description.name, description.channels, description.settings)
+        made = cls.empty(description)
         made.grid.add(data)
         return made
+
+    @classmethod
+    def empty(cls, description: MapDescription) -> Self:
+        """A map as a file describes it, without voxels."""
+        return cls._empty(description.name, description.channels, description.settings)
 
     @classmethod
     @abstractmethod

@@ -1,0 +1,67 @@
+"""Partial maps of one place, in tiles, become one map (Eq. 19 adds up), tile by tile: no more than two
+tiles are in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from ..errors import InputError
+from ..files.tiles import Tile, TileFolder
+from . import empty_map
+from .stored import MapDescription, describe_tiles, read_tile
+
+AT_ONCE = 16  # tiles written with one index
+
+
+def merge_tiles(parts: Sequence[TileFolder], out: TileFolder, tiles: Iterable[Tile]) -> int:
+    """Write to `out` the sum of what all parts hold of some tiles; returns how many voxels that are.
+
+    Where the manifest of `out` is of a surface map with votes and those of the parts are not, no cell
+    has a vote yet. Raises InputError where the maps differ, FileError, MapCorrupt or CapacityError.
+    """
+    description = _common(parts)
+    wanted = describe_tiles(out)
+    if (wanted.kind, wanted.name, wanted.channels) != _identity(description):
+        raise InputError(f"merge: {out.path} is for another map than {parts[0].path}")
+    scratch, voxels = empty_map(description), 0
+    added = [field for field in wanted.fields if field not in description.fields]
+    waiting: dict[Tile, dict] = {}
+    for tile in sorted(tiles):
+        scratch.grid.retain(np.zeros(0, np.int32))
+        for part in parts:
+            if tile not in part.tiles:
+                continue
+            data = read_tile(part, tile)
+            if len(scratch.grid):
+                scratch.fuse_voxels(data)
+            else:
+                scratch.grid.add(data)
+        data = scratch.grid.export()
+        more = {each.name: np.zeros((len(data), *each.shape), each.dtype) for each in added}
+        waiting[tile] = {**data.tensors, **more}
+        voxels += len(data)
+        if len(waiting) == AT_ONCE:
+            out.write(waiting)
+            waiting = {}
+    out.write(waiting)
+    return voxels
+
+
+def _common(parts: Sequence[TileFolder]) -> MapDescription:
+    """What all parts are; raises InputError where they differ."""
+    first = describe_tiles(parts[0])
+    for part in parts[1:]:
+        other = describe_tiles(part)
+        if (_identity(other), other.settings) != (_identity(first), first.settings):
+            raise InputError(
+                f"merge: {parts[0].path} and {part.path} hold maps of other kinds or settings, which "
+                "cannot be added up"
+            )
+    return first
+
+
+def _identity(description: MapDescription) -> tuple[str, str, int]:
+    return description.kind, description.name, description.channels
