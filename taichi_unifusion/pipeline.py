@@ -299,7 +299,7 @@ class Pipeline:
         early, an error of any kind too, is in the result, with all that was done until then; raises
         it, or DatasetError, only where not one frame could be used.
         """
-        self.settle(_first_frames(sequence, stop) if not self._maps else ())
+        self.settle(first_frames(sequence, stop) if not self._maps else ())
         log, failure, interrupted = RunLog(sequence, self.config.preprocess), None, False
         for i, load in enumerate(load_ahead(sequence)):
             if interrupted := stop():
@@ -360,7 +360,7 @@ class Pipeline:
         )
 
 
-def _first_frames(sequence: Sequence[Frame], stop: Callable[[], bool]) -> Iterator[Frame]:
+def first_frames(sequence: Sequence[Frame], stop: Callable[[], bool]) -> Iterator[Frame]:
     """Some of the first frames of a sequence, those that can be loaded."""
     for i in range(0, min(len(sequence), SETTLE_STEP * SETTLE_FRAMES), SETTLE_STEP):
         if stop():

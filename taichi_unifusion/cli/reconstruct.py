@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from tyro.conf import arg
 
+from ..cluster.engine import ClusterSettings
 from ..config import Config
 from ..datasets import Dataset
 from ..geometry.gravity import Up, parse_up
@@ -19,6 +20,7 @@ from ..tracking import check_poses, track
 from .color_camera import found_color, given_color
 from .interrupts import INTERRUPTED, stop_on_signal
 from .live import LiveOptions, reconstruct_live
+from .on_workers import check_workers, remove_shards, run_on_workers
 from .options import (
     OutputOptions,
     RecordingOptions,
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from ..results import RunFolder
     from ..results.record import ColorRecord
     from ..run_log import RunResult
+    from ..tracking.sequence import PosedFrames
     from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
@@ -62,6 +65,7 @@ class Reconstruct:
     output: Annotated[OutputOptions, arg(name="")]
     watch: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
     live: Annotated[LiveOptions, arg(name="")] = field(default_factory=LiveOptions)
+    cluster: Annotated[ClusterSettings, arg(name="")] = field(default_factory=ClusterSettings)
     settings: Settings = field(default_factory=Config, kw_only=True)
 
 
@@ -84,6 +88,9 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     also a map of its features.
     """
     check_poses(recording, options.poses.tracking, options.poses.trajectory)
+    check_workers(
+        options.cluster, encoder is not None, options.watch.view or options.watch.view_window
+    )
     recording, color = given_color(recording, options.recording.color_camera)
     from ..results.lock import lock_folder
     from ..results.writer import prepare_results
@@ -138,23 +145,29 @@ def _fuse_and_write(
     from ..results.summary import summarize
     from ..results.writer import write_results
 
-    tracking, written = None, ()
+    tracking, tracked, written = None, None, ()
     if options.poses.tracked:
         recording, tracking = _track(recording, options, folder, stop)
-        written = folder.tracking_files
+        tracked, written = recording.tracking.frames, folder.tracking_files
     recording, color = found_color(recording, color)
     frames = recording[:: options.recording.every]
     source = source_of(options.recording, len(frames), color)
-    pipeline = Pipeline(options.settings, encoder=encoder, tiles=folder.map_folder)
-    with frame_progress(len(frames)) as on_frame:
-        run = pipeline.run(
-            frames,
-            strict=options.recording.strict,
-            stop=stop,
-            on_frame=on_frame,
-            on_step=watcher.on_step,
-            on_skip=watcher.on_skip,
+    if options.cluster.wanted:
+        poses = tracked and tracked[:: options.recording.every]
+        pipeline, run = run_on_workers(
+            frames, source, poses, options.settings, options.cluster, folder, stop
         )
+    else:
+        pipeline = Pipeline(options.settings, encoder=encoder, tiles=folder.map_folder)
+        with frame_progress(len(frames)) as on_frame:
+            run = pipeline.run(
+                frames,
+                strict=options.recording.strict,
+                stop=stop,
+                on_frame=on_frame,
+                on_step=watcher.on_step,
+                on_skip=watcher.on_skip,
+            )
     if not run.steps:
         logger.warning(
             "stopped before the first frame was done; %s",
@@ -172,6 +185,8 @@ def _fuse_and_write(
             len(frames),
         )
     results = write_results(folder.path, pipeline, run, source, tracking, written, up)
+    if not results.failures:
+        remove_shards(folder.shards)
     print(
         json.dumps(results.record.to_json(), indent=2)
         if options.output.json
@@ -204,7 +219,7 @@ def _report_missing(run: RunResult, frames: int) -> int:
 
 def _track(
     recording: Dataset, options: Reconstruct, folder: RunFolder, stop: Callable[[], bool]
-) -> tuple[Dataset, Mapping[str, Any]]:
+) -> tuple[PosedFrames, Mapping[str, Any]]:
     """The frames with the poses that are asked for, and what to say of them in the record.
 
     All frames are tracked, whatever --every leaves for the map: small steps are easier. Poses are

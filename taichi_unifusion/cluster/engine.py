@@ -71,23 +71,17 @@ class Engine:
         """The result of `work` for each of the arguments, or the error that it ended with; None for
         what was not done because `stop` said so. Work of a worker that is lost is done again.
         """
-        from distributed import wait
-        from distributed.client import FIRST_COMPLETED
+        from distributed import client as dask_client
 
-        futures = [
-            self._client.submit(
-                work,
-                *each,
-                pure=False,
-                retries=0,
-                key=f"{work.__name__}-{n}-{id(self)}-{id(arguments)}",
-            )
-            for n, each in enumerate(arguments)
-        ]
+        wait: Any = dask_client.wait
+
+        futures = [self._client.submit(work, *each, pure=False) for each in arguments]
         pending = set(futures)
         while pending and not stop():
             try:
-                done, pending = wait(list(pending), timeout=0.5, return_when=FIRST_COMPLETED)
+                done, pending = wait(
+                    list(pending), timeout=0.5, return_when=dask_client.FIRST_COMPLETED
+                )
             except TimeoutError:
                 continue
             for _ in done:
@@ -117,11 +111,11 @@ def open_engine(settings: ClusterSettings) -> Iterator[Engine]:
     Raises MissingDependency without Dask, InputError where a cluster cannot be reached.
     """
     try:
-        import dask
         import distributed
+        from dask import config as dask_config
     except ImportError:
         raise MissingDependency(LACKING) from None
-    dask.config.set({"distributed.scheduler.allowed-failures": RETRIES})
+    dask_config.set({"distributed.scheduler.allowed-failures": RETRIES})
     with ExitStack() as stack:
         if settings.cluster.startswith(SLURM):
             address = stack.enter_context(_slurm(settings.cluster.removeprefix(SLURM)))
@@ -155,7 +149,7 @@ def _local(distributed: Any, workers: int) -> Any:
 def _slurm(file: str) -> Any:
     """Jobs of SLURM as a file says; raises MissingDependency or InputError."""
     try:
-        from dask_jobqueue import SLURMCluster
+        from dask_jobqueue import SLURMCluster  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingDependency(
             "--cluster slurm: needs dask-jobqueue: pip install 'taichi-unifusion[cluster]'"

@@ -33,7 +33,6 @@ T = TypeVar("T")
 SHARDS_A_WORKER = 2  # at least, so that nobody waits long for the last one
 LARGEST_SHARD = 500  # frames
 GROUPS_A_WORKER = 2  # of tiles
-WORK = "shards"  # the folder beside the maps where partial ones lie until the run is done
 
 
 @dataclass(frozen=True)
@@ -87,11 +86,6 @@ def plan(job: Job, workers: int) -> list[Shard]:
     return cut(source.frames, starts, wanted)
 
 
-def remove_shards(job: Job) -> None:
-    """Remove what lies on disk of the shards of a run that is done."""
-    shutil.rmtree(job.folder, ignore_errors=True)
-
-
 def _merge(job: Job, done: Sequence[ShardDone], engine: Engine) -> dict[str, TileFolder]:
     """The sum of all shards' maps, by name."""
     folder = Path(job.folder) / "merged"
@@ -131,11 +125,11 @@ def _pipeline_of(job: Job, merged: dict[str, TileFolder], maps: Path) -> Pipelin
     """A pipeline whose maps lie in tiles in a folder, where the merged ones are moved to."""
     memory = job.config.map_memory or "2GB"
     pipeline = Pipeline(replace(job.config, map_memory=memory), tiles=maps)
-    pipeline.settle(())
+    names = list(pipeline.maps)
     assert pipeline.memory is not None
-    for name, each in pipeline.memory.sets.items():
+    for name in names:
         if name in merged:
-            each.folder.adopt(merged[name])
+            pipeline.memory.sets[name].folder.adopt(merged[name])
     return pipeline
 
 

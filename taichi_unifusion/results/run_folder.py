@@ -72,6 +72,11 @@ class RunFolder:
         return dict(sorted({**files, **tiled}.items()))
 
     @property
+    def shards(self) -> Path:
+        """Where the partial maps of workers lie until a run is done."""
+        return self.path / "shards"
+
+    @property
     def features(self) -> Path:
         """The map of image-text features, which questions are put to."""
         return self.saved_map("features")
