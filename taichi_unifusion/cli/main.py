@@ -25,6 +25,7 @@ from tyro.conf import subcommand
 from ..config import Config, config_of, load_config
 from ..datasets.doctor.fix import read_fix
 from ..errors import FileError, UniFusionError, as_known, check_choice
+from .batch import Batch, batch
 from .config import ShowConfig, show_config
 from .convert import Convert, convert
 from .evaluate import METRICS, Evaluate
@@ -33,6 +34,7 @@ from .formats import ShowFormats, show_formats
 from .help_texts import few_settings, no_settings, whole_sentences, with_long_names
 from .info import Info, info
 from .interrupts import INTERRUPTED
+from .merge import Merge, merge
 from .mesh import ExtractMesh, extract_mesh
 from .query import Query, query
 from .reconstruct import Reconstruct, reconstruct
@@ -62,6 +64,8 @@ COMMANDS: Commands = {
     "view": (View, view),
     "render": (Render, render),
     "mesh": (ExtractMesh, extract_mesh),
+    "merge": (Merge, merge),
+    "batch": (Batch, batch),
     "export": (Export, export),
     "convert": (Convert, convert),
     "info": (Info, info),

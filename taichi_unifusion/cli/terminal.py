@@ -92,12 +92,13 @@ def report(errors: Sequence[Exception]) -> int:
 
 
 @contextmanager
-def frame_progress(total: int) -> Iterator[Callable[[int, int], None]]:
-    """Gives a function to call with (frames done, frames in all): a bar with rate and time left, or
+def frame_progress(total: int, what: str = "frame") -> Iterator[Callable[[int, int], None]]:
+    """Gives a function to call with (frames done, frames in all), or
+    `what` else is counted: a bar with rate and time left, or
     now and then a line.
     """
     if not sys.stderr.isatty():
-        yield _progress_lines()
+        yield _progress_lines(what)
         return
     from rich.console import Console
     from rich.progress import (
@@ -111,7 +112,7 @@ def frame_progress(total: int) -> Iterator[Callable[[int, int], None]]:
 
     columns = (
         SpinnerColumn(),
-        TextColumn("frames"),
+        TextColumn(f"{what}s"),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"),
@@ -119,11 +120,11 @@ def frame_progress(total: int) -> Iterator[Callable[[int, int], None]]:
         TextColumn("left"),
     )
     with Progress(*columns, console=Console(stderr=True)) as bar, _above(bar):
-        task = bar.add_task("frames", total=total, rate="")
+        task = bar.add_task(what, total=total, rate="")
 
         def update(done: int, total: int) -> None:
             speed = bar.tasks[0].speed
-            bar.update(task, completed=done, rate=f"{speed:.1f} frames/s" if speed else "")
+            bar.update(task, completed=done, rate=f"{speed:.1f} {what}s/s" if speed else "")
 
         yield update
 
@@ -143,7 +144,7 @@ def _above(bar: Any) -> Iterator[None]:
             handler.write_above_bar = None
 
 
-def _progress_lines() -> Callable[[int, int], None]:
+def _progress_lines(what: str) -> Callable[[int, int], None]:
     first, last = None, -LINE_INTERVAL
 
     def update(done: int, total: int) -> None:
@@ -154,10 +155,10 @@ def _progress_lines() -> Callable[[int, int], None]:
             return
         last, rate = now, (done - first[1]) / (now - first[0]) if now > first[0] else 0.0
         left = (
-            f", {rate:.1f} frames/s, {(total - done) / rate:.0f} s left"
+            f", {rate:.1f} {what}s/s, {(total - done) / rate:.0f} s left"
             if rate and done < total
             else ""
         )
-        logger.info("frame %d of %d%s", done, total, left)
+        logger.info("%s %d of %d%s", what, done, total, left)
 
     return update

@@ -18,6 +18,8 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 RETRIES = 5  # of work whose worker was lost
+CONNECTING = 30  # [s] that a scheduler may take to answer
+KERNELS = "TI_OFFLINE_CACHE_FILE_PATH"  # where Taichi keeps them
 SLURM = "slurm:"
 LACKING = "--workers and --cluster need Dask: pip install 'taichi-unifusion[cluster]'"
 
@@ -104,6 +106,23 @@ def _result(future: Any) -> Any:
         raise
 
 
+def own_kernels() -> dict[str, str]:
+    """The environment in which Taichi keeps compiled kernels in a folder of this worker; empty outside
+    of workers, and where a folder is named already.
+    """
+    from distributed import get_worker
+
+    try:
+        worker = str(get_worker().name)
+    except ValueError:  # not in a worker
+        return {}
+    if KERNELS in os.environ:
+        return {}
+    name = "".join(letter if letter.isalnum() else "-" for letter in worker)
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return {KERNELS: str(cache / "taichi_unifusion" / f"worker-{name}")}
+
+
 @contextmanager
 def open_engine(settings: ClusterSettings) -> Iterator[Engine]:
     """Workers that are ready; those on this machine listen on 127.0.0.1 alone and end with the block.
@@ -124,7 +143,7 @@ def open_engine(settings: ClusterSettings) -> Iterator[Engine]:
         else:
             address = stack.enter_context(_local(distributed, settings.workers))
         try:
-            client = stack.enter_context(distributed.Client(address, timeout=30))
+            client = stack.enter_context(distributed.Client(address, timeout=CONNECTING))
         except (OSError, ValueError, TimeoutError) as error:
             raise InputError(
                 f"--cluster {settings.cluster}: no scheduler answers there ({error}); start one with: dask scheduler"

@@ -8,7 +8,6 @@ import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from .. import runtime
 from ..config import Config
@@ -20,6 +19,7 @@ from ..maps.tile_merge import merge_tiles
 from ..pipeline import Pipeline
 from ..run_log import SKIP_REASONS, RunResult, SkippedFrame
 from ..types import Trajectory
+from .engine import own_kernels
 from .shards import Job, Shard, ShardDone, read_done, write_done
 from .votes import VOTES_MANIFEST, Voters, add_votes
 
@@ -29,10 +29,7 @@ DONE, MAPS, VOTES = "done.json", "maps", "votes"  # in the folder of a shard
 
 def start(config: Config) -> None:
     """Start Taichi in a worker, with a cache of kernels of its own: its lock is for one process."""
-    if "TI_OFFLINE_CACHE_FILE_PATH" not in os.environ:
-        worker = os.environ.get("UNIFUSION_WORKER", "0")
-        cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-        os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = str(cache / "taichi_unifusion" / worker)
+    os.environ.update(own_kernels())
     runtime.init(config.device, threads=config.threads or None)
 
 

@@ -152,6 +152,12 @@ class TileFolder:
         self._write_index()
         _remove([*replaced, other.index])
 
+    def remove(self) -> None:
+        """Remove the tiles, the index, and the folder if it holds nothing else."""
+        _remove([*(self.path / each.file for each in self.tiles.values()), self.index])
+        with suppress(OSError):
+            self.path.rmdir()
+
     def _write_index(self) -> None:
         tiles = [{"tile": tile, **asdict(each)} for tile, each in sorted(self.tiles.items())]
         values = {"format": FORMAT, "format_version": FORMAT_VERSION, "map": self.manifest}

@@ -121,6 +121,8 @@ def read_stored(path: str | os.PathLike[str]) -> tuple[MapDescription, VoxelData
             for field in (KEYS, *description.fields)
         }
         _check_voxels(path, description, fields)  # two tiles may not hold the same voxel
+        order = np.lexsort(fields[KEYS.name].T[::-1])
+        fields = {name: values[order] for name, values in fields.items()}
         return description, VoxelData(fields.pop(KEYS.name), fields)
     tensors, manifest = read_map(path, check=partial(describe, path))
     description = describe(path, manifest)

@@ -5,13 +5,15 @@ tiles are in memory.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
 from ..files.tiles import Tile, TileFolder
 from . import empty_map
-from .stored import MapDescription, describe_tiles, read_tile
+from .stored import MapDescription, describe_tiles, read_stored, read_tile
+from .working_set import key_codes, tile_of
 
 AT_ONCE = 16  # tiles written with one index
 
@@ -48,6 +50,21 @@ def merge_tiles(parts: Sequence[TileFolder], out: TileFolder, tiles: Iterable[Ti
             waiting = {}
     out.write(waiting)
     return voxels
+
+
+def as_tiles(path: Path, folder: Path) -> TileFolder:
+    """The tiles of a map; those of a map in one file are written to `folder`. Raises FileError or
+    MapCorrupt.
+    """
+    if TileFolder.is_one(path):
+        return TileFolder.open(path)
+    description, data = read_stored(path)
+    tiles = TileFolder.create(folder, empty_map(description).manifest())
+    codes = key_codes(data.keys)
+    for code in np.unique(codes).tolist():
+        rows = codes == code
+        tiles.write({tile_of(code): {name: each[rows] for name, each in data.tensors.items()}})
+    return tiles
 
 
 def _common(parts: Sequence[TileFolder]) -> MapDescription:

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files.tiles import Tile, TileFolder
 from ..types import Frame
+from . import empty_map
 from .base_map import BaseMap
 from .settings import parse_bytes
-from .stored import read_tile
+from .stored import describe_tiles, read_tile
 
 logger = logging.getLogger(__name__)
 
@@ -130,6 +131,14 @@ class MapMemory:
         self.sets: dict[str, WorkingSet] = {}
         self._turn = 0
         self._seen: dict[str, set[int]] = {}  # since `settle` was called last
+
+    @classmethod
+    def over(cls, folders: Mapping[str, TileFolder], limit: int) -> MapMemory:
+        """Memory for reading maps that lie in tiles, by name; raises MapCorrupt."""
+        memory = cls(limit, next(iter(folders.values())).path.parent)
+        for name, folder in folders.items():
+            memory.sets[name] = WorkingSet(empty_map(describe_tiles(folder)), folder)
+        return memory
 
     def follow(self, maps: Mapping[str, BaseMap]) -> None:
         """Take in maps that are new; raises FileError."""

@@ -1,0 +1,50 @@
+"""The engine: results come back, errors too, and work of a lost worker is done again."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from taichi_unifusion.cluster.engine import ClusterSettings, open_engine
+from taichi_unifusion.errors import FileError, InputError
+
+pytest.importorskip("distributed", reason="needs Dask: pip install 'taichi-unifusion[cluster]'")
+
+
+def double(number: int, folder: str) -> tuple[int, int]:
+    """Twice a number; 3 ends its worker when it is asked for the first time, 4 is refused."""
+    first = Path(folder) / "was-here"
+    if number == 3 and not first.exists():
+        first.touch()
+        os._exit(9)
+    if number == 4:
+        raise FileError("4.png: no such file")
+    return 2 * number, os.getpid()
+
+
+def test_work_is_done_elsewhere_and_again_where_a_worker_is_lost(tmp_path):
+    done = []
+    with open_engine(ClusterSettings(workers=1)) as engine:
+        found = engine.map(
+            double, [(n, str(tmp_path)) for n in range(1, 5)], lambda: done.append(1)
+        )
+    assert [each[0] for each in found[:3]] == [2, 4, 6]
+    assert isinstance(found[3], FileError) and "4.png" in str(found[3])
+    assert os.getpid() not in {each[1] for each in found[:3]} and len(done) == 4
+
+
+def test_nobody_answers_at_the_address(monkeypatch):
+    monkeypatch.setattr("taichi_unifusion.cluster.engine.CONNECTING", 2)
+    cluster = ClusterSettings(cluster="tcp://127.0.0.1:1")
+    with pytest.raises(InputError, match="no scheduler answers"), open_engine(cluster):
+        pass
+
+
+def test_workers_are_counted_and_one_place_is_named():
+    with pytest.raises(InputError, match="workers"):
+        ClusterSettings(workers=-1)
+    with pytest.raises(InputError, match="one of"):
+        ClusterSettings(workers=2, cluster="tcp://x:1")
+    assert not ClusterSettings().wanted and ClusterSettings(workers=1).share >= 1
