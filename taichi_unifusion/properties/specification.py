@@ -93,7 +93,7 @@ def name_of(text: str) -> str:
     """The name of the property that the text names, which nothing is made for; raises InputError."""
     name, rest = [*re.split("[=,]", text, maxsplit=1), ""][:2]
     methods = PROPERTIES.get(name)
-    return name if methods is None else _split(name, rest, methods)[2].get("name", name)
+    return name if methods is None else str(_split(name, rest, methods)[2].get("name", name))
 
 
 def _split(name: str, rest: str, methods: dict) -> tuple[str, str, dict[str, str]]:
