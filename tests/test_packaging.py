@@ -32,6 +32,8 @@ IMPORT_NAMES = {
     "cv2": "opencv-python-headless",
     "skimage": "scikit-image",
     "yaml": "pyyaml",
+    "PIL": "pillow",
+    "dask_jobqueue": "dask-jobqueue",
     "fast_simplification": "fast-simplification",
     "pxr": "usd-core",
     "backports": "backports-zstd",
