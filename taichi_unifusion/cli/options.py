@@ -67,7 +67,8 @@ class RecordingOptions:
         ),
     ]
     path: Annotated[
-        Positional[Path | None], arg(metavar="[PATH]", help_behavior_hint="(synthetic needs none)")
+        Positional[Path | None],
+        arg(metavar="[PATH]", help_behavior_hint="(synthetic and live cameras need none)"),
     ] = None
     """Where the recording lies."""
     start: Annotated[int, arg(metavar="A")] = 0
@@ -87,7 +88,7 @@ class RecordingOptions:
     max_difference: Annotated[
         float | None, arg(metavar="SECONDS", help_behavior_hint=FORMAT_DEFAULT)
     ] = None
-    """How far time stamps of depth, colour and pose may be apart (tum, folder, k4a)."""
+    """How far time stamps of depth, colour and pose may be apart (tum, folder, k4a, rosbag, realsense)."""
     camera_path: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(scene needs one)")
     ] = None

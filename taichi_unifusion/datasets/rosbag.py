@@ -8,8 +8,7 @@ there. 16 bits are millimetres unless `depth_scale` says else.
 
 Poses: transforms (tf) from the root of the tree to the depth image's frame, else a topic of Odometry,
 PoseStamped or the like with the transforms that lead on to the camera; interpolated at the image's stamp.
-Topics of ROS 1 and 2 are the same otherwise. Images are read when asked for; opening reads the stamps of
-all and the poses.
+Images are read when asked for; opening reads the stamps of all and the poses.
 """
 
 from __future__ import annotations
