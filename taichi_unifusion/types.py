@@ -261,7 +261,8 @@ class PointCloud:
         """Raise InputError for normals of another length than 1; those that are not finite are left
         out later.
         """
-        squares = np.einsum("ij,ij->i", self.normals, self.normals)
+        normals = np.asarray(self.normals, np.float32)
+        squares = np.einsum("ij,ij->i", normals, normals)
         off = np.abs(squares - 1)
         if (off > UNIT_TOLERANCE).any():  # False for NaN
             worst = int(np.nanargmax(off))

@@ -93,7 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             logger.error("stopped")
             return INTERRUPTED
         except BrokenPipeError:  # the reader of our output has left, as `head` does
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            if sys.stdout is not None:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return DONE
         except UniFusionError as error:
             if debug:

@@ -168,7 +168,7 @@ def _local(distributed: Any, workers: int) -> Any:
 def _slurm(file: str) -> Any:
     """Jobs of SLURM as a file says; raises MissingDependency or InputError."""
     try:
-        from dask_jobqueue import SLURMCluster  # pyright: ignore[reportMissingImports]
+        from dask_jobqueue.slurm import SLURMCluster
     except ImportError:
         raise MissingDependency(
             "--cluster slurm: needs dask-jobqueue: pip install 'taichi-unifusion[cluster]'"

@@ -221,7 +221,9 @@ def product(a: ti.u32, b: ti.template()) -> ti.u32:
 @ti.func
 def chance(seed: ti.u32, i: ti.i32) -> ti.f32:
     """A number in [0, 1) for the i-th number of a voxel."""
-    h = product(ti.cast((ti.cast(seed, ti.u64) + ti.cast(i, ti.u64)) & ti.u64(LOW), ti.u32), 0x9E3779B1)
+    h = product(
+        ti.cast((ti.cast(seed, ti.u64) + ti.cast(i, ti.u64)) & ti.u64(LOW), ti.u32), 0x9E3779B1
+    )
     h = product(h ^ (h >> 15), 0x85EBCA77)
     h = h ^ (h >> 13)
     return ti.cast(h >> 8, ti.f32) * (1.0 / (1 << 24))
