@@ -8,7 +8,8 @@ WORKERS ?= 2
 # ROS and the like point these at another Python's packages.
 unexport PYTHONPATH PYTHONHOME
 
-demo: setup
+demo:
+	@bash scripts/setup.sh demo
 	.venv/bin/unifusion reconstruct synthetic --out results/demo
 	@echo
 	@echo "To look at it in the browser: .venv/bin/unifusion view results/demo"

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Set-up behind `make demo` and `make test`: a virtual environment in .venv with this package, what checks it, and Open3D.
+# Set-up behind `make demo` and `make test`: a virtual environment in .venv with this package, what checks it, and Open3D;
+# with the argument `demo`, this package and its viewer alone.
 #
 # Does nothing when .venv already fits: same pyproject.toml, same script, same folder, a suitable Python.
 # PYTHON=... chooses the interpreter. Network: the package index through pip, and apt where a system package is missing.
@@ -10,6 +11,7 @@ export PIP_USER=0 PIP_DISABLE_PIP_VERSION_CHECK=1
 # What the shared libraries of Open3D 0.19 and 0.20 link and Debian does not install by itself. Taichi links libX11 too.
 OPEN3D_LIBRARIES=(libgl1 libegl1 libx11-6 libgomp1 libidn2-0 libusb-1.0-0)
 STAMP=.venv/set-up-done
+WANTED=${1:-all}
 SUDO=""
 [ "$(id -u)" -eq 0 ] || SUDO=sudo
 
@@ -97,14 +99,17 @@ open3d_imports() { .venv/bin/python -c 'import open3d' >/dev/null 2>&1; }
 fingerprint() { { cat pyproject.toml scripts/setup.sh; identity .venv/bin/python; } | cksum; }
 
 if venv_fits; then
-    [ "$(cat $STAMP 2>/dev/null)" != "$(fingerprint)" ] || exit 0
+    for done in all "$WANTED"; do
+        [ "$(cat $STAMP 2>/dev/null)" != "$(fingerprint) $done" ] || exit 0
+    done
 else
     make_venv
 fi
 rm -f $STAMP
-say "installing packages into .venv; the first time this downloads about 0.8 GB"
-pip_install -e '.[dev]' ||
+if [ "$WANTED" = demo ]; then extra=viewer size=0.3; else extra=dev size=0.8; fi
+say "installing packages into .venv; the first time this downloads about $size GB"
+pip_install -e ".[$extra]" ||
     die "pip could not install the packages (its own message is above); check the network, then run the command again."
-add_open3d
-fingerprint > $STAMP
+[ "$WANTED" = demo ] || add_open3d
+echo "$(fingerprint) $WANTED" > $STAMP
 say "ready"

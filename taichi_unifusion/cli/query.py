@@ -18,6 +18,7 @@ from .texts import make_encoder, templates_of
 
 if TYPE_CHECKING:
     from ..language.questions import Answer
+    from ..results.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
 
@@ -107,7 +108,10 @@ def query(options: Query) -> int:
         listed.append({"mesh": file.name, "picture": picture.name, **describe(answer, options.top)})
     text = json.dumps(listed, indent=2)
     writer.write(folder.answers, lambda path: write_text(path, text + "\n"))
-    print(text if options.encoder.json else "\n\n".join(_table(entry) for entry in listed))
+    if options.encoder.json:
+        print(text)
+    else:
+        print("\n\n".join([*map(_table, listed), _origin(folder)]))
     writer.attempt(
         f"{folder.record}: could not be updated", lambda: add_answers(folder, writer.written)
     )
@@ -137,6 +141,18 @@ def file_name(text: str) -> str:
     """A text as a part of a file's name."""
     kept = "".join(letter if letter.isalnum() else "-" for letter in text.lower())
     return "-".join(part for part in kept.split("-") if part)[:60] or "text"
+
+
+def _origin(folder: RunFolder) -> str:
+    """Where the coordinates of tables begin."""
+    from ..errors import FileError
+    from ..results.record import read_record
+    from ..results.summary import describe_origin
+
+    try:
+        return f"x y z from {describe_origin(read_record(folder.record))}"
+    except FileError:  # a folder without a record, or a damaged one
+        return "x y z in the world of the map"
 
 
 def _table(entry: dict[str, Any]) -> str:

@@ -185,12 +185,15 @@ def match_poses(
     """
     pairs = associate(estimate.timestamps, ground_truth.timestamps, max_difference)
     if len(pairs) < FEWEST:
+        both = (estimate, ground_truth)
+        # numbers of frames stand in for time stamps where a recording has none
+        unit = "frames" if all((t.timestamps % 1 == 0).all() for t in both) else "s"
         spans = [
-            f"{t.timestamps[0]:.12g} to {t.timestamps[-1]:.12g} s" if len(t) else "nothing"
-            for t in (estimate, ground_truth)
+            f"{t.timestamps[0]:.12g} to {t.timestamps[-1]:.12g} {unit}" if len(t) else "nothing"
+            for t in both
         ]
         raise InputError(
-            f"trajectory: {len(pairs)} of {len(estimate)} estimated poses lie within {max_difference:g} s of a "
+            f"trajectory: {len(pairs)} of {len(estimate)} estimated poses lie within {max_difference:g} {unit} of a "
             f"true one, {FEWEST} are needed; the estimate covers {spans[0]} and the ground truth {spans[1]}"
         )
     return estimate.T_world_camera[pairs[:, 0]], ground_truth.T_world_camera[pairs[:, 1]]

@@ -66,13 +66,41 @@ def vertex_areas(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
 
 
 def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray[np.float32]:
-    """Unit normals (V, 3): the mean of the adjacent faces', weighted by area; 0 without a face."""
+    """Unit normals (V, 3): the mean of the adjacent faces', weighted by area; 0 without a face.
+
+    Where that has no direction, since all of them are too small, see `fill_normals`.
+    """
     weighted = np.repeat(area_vectors(vertices, faces), 3, axis=0)
     sums = np.stack(
         [np.bincount(faces.ravel(), weighted[:, k], len(vertices)) for k in range(3)], axis=1
     )
     lengths = np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-30)
-    return (sums / lengths).astype(np.float32)
+    return fill_normals((sums / lengths).astype(np.float32), vertices, faces)
+
+
+def fill_normals(normals: NDArray[np.float32], vertices: NDArray, faces: NDArray) -> NDArray:
+    """Unit normals (V, 3) also at the vertices of faces that are too small to have had a say: the mean
+    of these faces', whatever their size, else of the vertices beside, else z.
+
+    Those that have a length stay as they are; without a face a normal is 0.
+    """
+    lacking = np.zeros(len(normals), np.bool_)
+    lacking[faces.ravel()] = True
+    lacking &= np.abs(normals).max(axis=1, initial=0) < 0.1  # a unit vector has a part of 0.57
+    if not lacking.any():
+        return normals
+    around = faces[lacking[faces].any(axis=1)]
+    filled = normals.astype(np.float64)
+    own = area_vectors(vertices.astype(np.float64), around)
+    own /= np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-300)
+    for by_face in (own, normals[around].sum(axis=1, dtype=np.float64), np.array([0.0, 0.0, 1.0])):
+        sums = np.zeros(filled.shape)
+        np.add.at(sums, around, np.broadcast_to(by_face, (len(around), 3))[:, None])
+        lengths = np.linalg.norm(sums, axis=1)
+        found = lacking & (lengths > 1e-6)
+        filled[found] = sums[found] / lengths[found, None]
+        lacking &= ~found
+    return filled.astype(np.float32)
 
 
 def sample_surface(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..geometry.triangles import areas, used_vertices
+from ..geometry.triangles import areas, fill_normals, used_vertices
 from ..kernels import marching_cubes as kernels
 from ..kernels import query
 from ..kernels.cells import CELLS
@@ -81,7 +81,7 @@ def extract_mesh(
     sums = np.zeros((len(vertices), 3), np.int32)
     if len(faces):
         kernels.sum_normals(vertices, faces, NORMAL_UNIT * (resolution / voxel_size) ** 2, sums)
-    mesh = Mesh(vertices, faces, _unit(sums))
+    mesh = Mesh(vertices, faces, fill_normals(_unit(sums), vertices, faces))
     # the cubes around a block were there for the normals on its border
     return mesh if wanted is None else mesh.part(wanted)[0]
 

@@ -14,7 +14,7 @@ from ..maps.stored import read_stored
 from .lock import who_writes
 from .record import Source, read_record
 from .run_folder import RunFolder
-from .summary import count_frames, describe_up
+from .summary import count_frames, describe_origin, describe_up
 from .tables import format_bytes, format_table
 
 T = TypeVar("T")
@@ -149,6 +149,7 @@ def _describe_run(file: Path) -> str:
     if frame := record.milliseconds.get("frame"):
         made += f", {frame.median:.0f} ms a frame (median)"
     lines.append(made)
+    lines.append(f"origin  {describe_origin(record)}")
     if record.T_up_world is not None:
         lines.append(f"up      {describe_up(record)}")
     return "\n".join(lines)

@@ -52,6 +52,7 @@ def summarize(record: RunRecord, files: Sequence[str], directory: Path) -> str:
     lines += ["", format_table(maps), ""]
     if mesh:
         lines.append(f"mesh     {mesh.vertices:,} vertices, {mesh.triangles:,} triangles")
+    lines.append(f"origin   {describe_origin(record)}")
     if record.T_up_world is not None:
         lines.append(f"up       {describe_up(record)}")
     lines += [
@@ -68,6 +69,13 @@ def count_frames(frames: FrameCounts) -> str:
     """How many frames were used, and how many were not."""
     stopped = ", stopped early" if frames.interrupted else ""
     return f"{frames.used} used, {frames.skipped} skipped{stopped}"
+
+
+def describe_origin(record: RunRecord) -> str:
+    """Where x = y = z = 0 is, and which way the axes point."""
+    if record.tracking and record.tracking.get("mode") == "rgbd":
+        return "the first camera: x to its right, y down, z forwards"
+    return "where the poses of the recording have it"
 
 
 def describe_up(record: RunRecord) -> str:

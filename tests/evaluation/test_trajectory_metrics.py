@@ -326,3 +326,16 @@ def later(seconds: float, count: int = 40) -> Trajectory:
 def test_bad_trajectories_are_told_in_one_sentence(estimate, options, error, told):
     with pytest.raises(error, match=told):
         evaluate_trajectory(estimate, curve(), **options)
+
+
+def test_where_there_are_no_time_stamps_frames_are_counted_and_not_seconds():
+    few = Trajectory(np.array([0.0, 10.0, 20.0]), curve().T_world_camera[:3])
+    other = Trajectory(np.array([1.0, 11.0, 21.0]), curve().T_world_camera[:3])
+    with pytest.raises(InputError) as error:
+        evaluate_trajectory(few, other, max_difference=0.5)
+    assert "within 0.5 frames of a true one" in str(error.value)
+    assert "covers 0 to 20 frames and the ground truth 1 to 21 frames" in str(error.value)
+    with pytest.raises(InputError, match=r"within 0\.5 s of .* covers 0\.25 to 20\.25 s"):
+        evaluate_trajectory(
+            Trajectory(few.timestamps + 0.25, few.T_world_camera), other, max_difference=0.5
+        )
