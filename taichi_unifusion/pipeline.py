@@ -22,7 +22,7 @@ from .errors import FrameError, InputError, as_known
 from .kernels.patches import Patches
 from .language.source import FeatureSource
 from .maps import BaseMap, FeatureMap, Integration, PropertyMap, SurfaceMap
-from .maps.detail import Sight, sight_of
+from .maps.detail import Sight, sight_of, sizes_sentence
 from .maps.follower import MapFollower
 from .maps.kept_window import KeptWindow
 from .maps.property_group import group_maps
@@ -39,6 +39,7 @@ from .run_log import (
     EmptyFrame,
     RunLog,
     RunResult,
+    RunSoFar,
     SkippedFrame,
     StageClock,
     StepResult,
@@ -69,6 +70,8 @@ class PropertySource(Source, Protocol):
     def make_map(self, frame: Frame | None = None) -> BaseMap: ...
 
 
+# is told between two windows what the run did until then, and the pipeline
+OnBorder = Callable[[RunLog, "Pipeline"], None]
 # is told of a frame that was fused, what that did, and the pipeline
 OnStep = Callable[[Frame, StepResult, "Pipeline"], None]
 
@@ -85,7 +88,8 @@ class Pipeline:
     them. `keep` is told of every window that was fused. Where it is a `WindowStore`, the maps can
     follow a trajectory that changes: `pipeline.follower`. With `map_memory` in the configuration,
     maps are kept within it; what does not fit lies in the folder `tiles`, a folder a map, and
-    `extract_mesh` goes through all of it.
+    `extract_mesh` goes through all of it. `maps` by name, of the same settings,
+    which must be settled, are gone on with.
     """
 
     def __init__(
@@ -97,6 +101,7 @@ class Pipeline:
         synchronize: bool = True,
         keep: Callable[[KeptWindow], None] | None = None,
         tiles: str | Path | None = None,
+        maps: Mapping[str, BaseMap] | None = None,
     ) -> None:
         self.config = config = config or Config()
         self.synchronize = synchronize
@@ -114,6 +119,7 @@ class Pipeline:
                 "limit or the store of windows out"
             )
         self._maps: dict[str, BaseMap] = {}
+        self._known = dict(maps or {})
         given = config.surface.voxel_size and config.color.voxel_size and not self.sources
         if config.voxel_size or given:  # nothing is left to choose
             self._make_maps(config.settled(()))
@@ -130,7 +136,7 @@ class Pipeline:
             if sight is None:
                 return False
             self._make_maps(self.config.settled(frames))
-            logger.info("%s", _sizes_sentence(self.config, sight))
+            logger.info("%s", sizes_sentence(self.config.surface.voxel_size, self.config.color.voxel_size, sight))
         return True
 
     def _make_maps(self, config: Config) -> None:
@@ -138,7 +144,11 @@ class Pipeline:
         features.
         """
         self.config = config
-        maps: list[BaseMap] = [SurfaceMap(config.surface), PropertyMap("color", 3, config.color)]
+        known = self._known
+        maps: list[BaseMap] = [
+            known.pop("surface", None) or SurfaceMap(config.surface),
+            known.pop("color", None) or PropertyMap("color", 3, config.color),
+        ]
         for name, source in self.sources.items():
             if isinstance(source, FeatureSource):
                 self.sources[name] = replace(source, settings=config.feature_map)
@@ -147,7 +157,8 @@ class Pipeline:
                     config.property_map, config.scale
                 )
                 self.sources[name] = sized
-                maps.append(sized.make_map())
+                maps.append(known.pop(name, None) or sized.make_map())
+        maps += known.values()
         self._maps = {each.name: each for each in maps}
         self.groups = group_maps(maps)
         if self.memory:
@@ -289,19 +300,25 @@ class Pipeline:
         on_frame: Callable[[int, int], None] = lambda done, total: None,
         on_step: OnStep = lambda frame, step, pipeline: None,
         on_skip: Callable[[SkippedFrame], None] = lambda skipped: None,
+        on_border: OnBorder | None = None,
+        before: RunSoFar | None = None,
     ) -> RunResult:
         """Fuse a sequence in order, skipping frames that cannot be used; `strict` ends the run at
         the first of them.
 
         `stop` is asked before every frame, `on_frame` told after it how many there were, `on_step`
         after each that was fused what it did, `on_skip` which one was not used and why: there a
-        viewer can look at the maps. What ends a run
+        viewer can look at the maps. `on_border` is told between two windows, when all frames so far are in
+        the maps; with what the run did until then as `before`, and the maps and `fusion.borders` of
+        that moment, another pipeline goes on, and ends as if nothing had stopped it. What ends a run
         early, an error of any kind too, is in the result, with all that was done until then; raises
         it, or DatasetError, only where not one frame could be used.
         """
         self.settle(first_frames(sequence, stop) if not self._maps else ())
-        log, failure, interrupted = RunLog(sequence, self.config.preprocess), None, False
-        for i, load in enumerate(load_ahead(sequence)):
+        log, failure, interrupted = RunLog(sequence, self.config.preprocess, before), None, False
+        if on_border is not None:
+            self.fusion.at_border = lambda: on_border(log, self)
+        for i, load in enumerate(load_ahead(sequence, log.done), log.done):
             if interrupted := stop():
                 break
             waiting = time.perf_counter()
@@ -317,9 +334,11 @@ class Pipeline:
                 failure = error if strict else None
             except Exception as error:  # noqa: BLE001 - none may cost the frames before it
                 failure = self._ended_by(error)
+            log.done = i + 1
             on_frame(i + 1, len(sequence))
             if failure:
                 break
+        self.fusion.at_border = None
         try:
             log.add_flush(self._flush())
         except Exception as error:  # noqa: BLE001
@@ -369,15 +388,6 @@ def first_frames(sequence: Sequence[Frame], stop: Callable[[], bool]) -> Iterato
             yield sequence[i]
         except Exception:  # noqa: BLE001 - `run` says so when it comes to it
             continue
-
-
-def _sizes_sentence(config: Config, sight: Sight) -> str:
-    """Which voxel sizes were chosen, why, and how to choose others."""
-    surface, color = (100 * each.voxel_size for each in (config.surface, config.color))
-    return (
-        f"voxels of {surface:g} cm, {color:g} cm for colour: the first frames look {sight.depth:.2g} m far; "
-        "detail (fine, coarse) or voxel_size choose others"
-    )
 
 
 def _by_name(sources: Iterable[Source]) -> dict[str, Source]:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import runtime
 from .datasets.file_recording import Recording
@@ -95,13 +96,34 @@ class RunResult:
     doubts: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class RunSoFar:
+    """A run up to a border of its windows, from where it can go on in another process."""
+
+    done: int  # frames of the sequence that were tried
+    steps: tuple[StepResult, ...]
+    skipped: tuple[SkippedFrame, ...]
+    timestamps: tuple[float | None, ...]  # of the steps
+    T_world_camera: tuple[NDArray[np.float64], ...]  # of the steps
+    warnings: tuple[str, ...]
+    seconds: float
+    scale_checked: bool
+    color_missing: bool
+    poses_judged: bool
+    doubts: tuple[str, ...]
+    readings: tuple[int, ...]
+
+
 class RunLog:
     """Collects a RunResult while frames are processed; warns at once of the first of every kind of
     trouble.
     """
 
     def __init__(
-        self, sequence: Sequence[Frame], settings: PreprocessSettings | None = None
+        self,
+        sequence: Sequence[Frame],
+        settings: PreprocessSettings | None = None,
+        before: RunSoFar | None = None,
     ) -> None:
         self.sequence, self.name = sequence, getattr(sequence, "name", "sequence")
         self.settings = settings or PreprocessSettings()
@@ -115,8 +137,41 @@ class RunLog:
         self.scale_checked = self.color_missing = False
         self.early = EarlyPairs()  # frames whose poses are checked against their depth
         self.doubts: list[str] = []  # said again at the end
+        self.done = 0  # frames tried
+        if before is not None:
+            self._go_on(before)
         for sentence in getattr(sequence, "warnings", ()):
-            self.warn(sentence)
+            if sentence not in self.warnings:
+                self.warn(sentence)
+
+    def _go_on(self, before: RunSoFar) -> None:
+        self.started -= before.seconds
+        self.done, self.warnings = before.done, list(before.warnings)
+        self.steps, self.skipped = list(before.steps), list(before.skipped)
+        self.reasons.update(frame.reason for frame in before.skipped)
+        self.poses = list(zip(before.timestamps, before.T_world_camera, strict=True))
+        self.scale_checked, self.color_missing = before.scale_checked, before.color_missing
+        self.readings, self.doubts = np.array(before.readings, np.int64), list(before.doubts)
+        if before.poses_judged:
+            self.early.take()
+
+    @property
+    def so_far(self) -> RunSoFar:
+        """What there is by now, to be kept."""
+        return RunSoFar(
+            self.done,
+            tuple(self.steps),
+            tuple(self.skipped),
+            tuple(stamp for stamp, _ in self.poses),
+            tuple(T for _, T in self.poses),
+            tuple(self.warnings),
+            time.perf_counter() - self.started,
+            self.scale_checked,
+            self.color_missing,
+            self.early.kept is None,
+            tuple(self.doubts),
+            tuple(self.readings.tolist()),
+        )
 
     def warn(self, sentence: str) -> None:
         self.warnings.append(sentence)

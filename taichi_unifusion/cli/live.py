@@ -76,7 +76,8 @@ def reconstruct_live(
     """Frames -> tracker -> maps while they come, then mesh -> results folder."""
     from ..pipeline import warm_up
     from ..results.lock import lock_folder
-    from ..results.writer import prepare_results, remove_temporaries
+    from ..results.safe_point import remove_temporaries
+    from ..results.writer import prepare_results
 
     source = open_source(recording, poses.tracking, live.live_speed)
     folder = prepare_results(output.out)

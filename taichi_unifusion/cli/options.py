@@ -152,6 +152,10 @@ class OutputOptions:
     """
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace files that stand in the way and that no run is known to have written."""
+    resume: FlagCreatePairsOff[bool] = False
+    """Go on with a run of the same options that was ended in this folder, whatever ended it."""
+    save_every: Annotated[float, arg(metavar="SECONDS")] = 60.0
+    """Time between safe points to go on from, which take a twentieth of the time at most; 0: none."""
     config: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
     """YAML file of settings that differ from the defaults; options given here count more."""
     json: FlagCreatePairsOff[bool] = False

@@ -15,9 +15,10 @@ from tyro.conf import arg
 from ..cluster.engine import ClusterSettings
 from ..config import Config
 from ..datasets import Dataset
+from ..errors import InputError
 from ..geometry.gravity import Up, parse_up
 from ..tracking import check_poses, track
-from .color_camera import found_color, given_color
+from .color_camera import given_color
 from .interrupts import INTERRUPTED, stop_on_signal
 from .live import LiveOptions, reconstruct_live
 from .on_workers import check_workers, remove_shards, run_on_workers
@@ -30,6 +31,7 @@ from .options import (
     source_of,
 )
 from .replacing import say_what_is_replaced
+from .resuming import end_saving, is_complete, make_pipeline, open_saver, registered
 from .terminal import DONE, FAILED, frame_progress, report
 from .viewing import WatchOptions, open_watcher
 
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from ..networks.encoders import ImageEncoder
     from ..results import RunFolder
     from ..results.record import ColorRecord
+    from ..results.saver import RunSaver
     from ..run_log import RunResult
     from ..tracking.sequence import PosedFrames
     from ..viewer.null import Watcher
@@ -88,6 +91,8 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     also a map of its features.
     """
     check_poses(recording, options.poses.tracking, options.poses.trajectory)
+    if options.cluster.wanted and options.output.resume:
+        raise InputError("--resume: a run on several workers cannot go on; leave one of them out")
     check_workers(
         options.cluster, encoder is not None, options.watch.view or options.watch.view_window
     )
@@ -99,11 +104,16 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     if up is None and recording.up is not None and not options.poses.tracked:
         up = Up(np.array(recording.up), "recording")
     folder = prepare_results(options.output.out)
+    frames = len(range(0, len(recording), options.recording.every))
     with lock_folder(folder):
+        if is_complete(folder, frames, options):
+            logger.info("%s holds the whole run already: there is nothing to resume", folder.path)
+            return DONE
+        saver = open_saver(frames, options, folder, encoder)
         say_what_is_replaced(
             folder, options.output, options.settings, encoder is not None, options.poses.tracked
         )
-        return _fuse_watched(recording, color, options, folder, encoder, up)
+        return _fuse_watched(recording, color, options, folder, encoder, up, saver)
 
 
 def _fuse_watched(
@@ -113,14 +123,17 @@ def _fuse_watched(
     folder: RunFolder,
     encoder: ImageEncoder | None,
     up: Up | None,
+    saver: RunSaver,
 ) -> int:
-    from ..results.writer import remove_temporaries
+    from ..results.safe_point import remove_temporaries
 
     frames = len(range(0, len(recording), options.recording.every))
     with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
         watcher = open_watcher(options.watch, folder.path.name, frames, stop)
         try:
-            code = _fuse_and_write(recording, color, options, folder, stop, encoder, up, watcher)
+            code = _fuse_and_write(
+                recording, color, options, folder, stop, encoder, up, watcher, saver
+            )
         except BaseException:
             watcher.close()
             raise
@@ -140,25 +153,26 @@ def _fuse_and_write(
     encoder: ImageEncoder | None,
     up: Up | None,
     watcher: Watcher,
+    saver: RunSaver,
 ) -> int:
-    from ..pipeline import Pipeline
     from ..results.summary import summarize
     from ..results.writer import write_results
 
     tracking, tracked, written = None, None, ()
     if options.poses.tracked:
-        recording, tracking = _track(recording, options, folder, stop)
+        recording, tracking = _track(recording, options, folder, stop, saver)
         tracked, written = recording.tracking.frames, folder.tracking_files
-    recording, color = found_color(recording, color)
+    recording, color = registered(recording, color, saver)
     frames = recording[:: options.recording.every]
     source = source_of(options.recording, len(frames), color)
+    saver.describe(source, tracking)
     if options.cluster.wanted:
         poses = tracked and tracked[:: options.recording.every]
         pipeline, run = run_on_workers(
             frames, source, poses, options.settings, options.cluster, folder, stop
         )
     else:
-        pipeline = Pipeline(options.settings, encoder=encoder, tiles=folder.map_folder)
+        pipeline = make_pipeline(options, encoder, folder, saver)
         with frame_progress(len(frames)) as on_frame:
             run = pipeline.run(
                 frames,
@@ -167,6 +181,8 @@ def _fuse_and_write(
                 on_frame=on_frame,
                 on_step=watcher.on_step,
                 on_skip=watcher.on_skip,
+                on_border=saver.at_border,
+                before=saver.resumed and saver.resumed.so_far,
             )
     if not run.steps:
         logger.warning(
@@ -192,7 +208,9 @@ def _fuse_and_write(
         if options.output.json
         else summarize(results.record, results.files, folder.path)
     )
-    code = report([error for error in (run.failure, *results.failures) if error])
+    ended = [error for error in (run.failure, *results.failures) if error]
+    code = report(ended)
+    end_saving(folder, done=not (run.interrupted or ended))
     code = _report_missing(run, len(frames)) or code
     return INTERRUPTED if stop() else code
 
@@ -218,7 +236,11 @@ def _report_missing(run: RunResult, frames: int) -> int:
 
 
 def _track(
-    recording: Dataset, options: Reconstruct, folder: RunFolder, stop: Callable[[], bool]
+    recording: Dataset,
+    options: Reconstruct,
+    folder: RunFolder,
+    stop: Callable[[], bool],
+    saver: RunSaver,
 ) -> tuple[PosedFrames, Mapping[str, Any]]:
     """The frames with the poses that are asked for, and what to say of them in the record.
 
@@ -228,8 +250,11 @@ def _track(
     from .. import runtime
     from ..files.trajectories import write_trajectory
     from ..results.ownership import mark_unfinished, owned_files
-    from ..tracking.sequence import write_tracking
+    from ..tracking.sequence import PosedFrames, write_tracking
 
+    if saver.tracked is not None:
+        posed = PosedFrames(recording, saver.tracked)
+        return posed, {"mode": options.poses.tracking, **posed.tracking.details}
     poses, settings = options.poses, options.settings
     runtime.init(settings.device, threads=settings.threads or None)
     with frame_progress(len(recording)) as on_frame:
@@ -247,4 +272,6 @@ def _track(
     mark_unfinished(folder, owned_files(folder) | set(map(folder.relative, folder.tracking_files)))
     write_tracking(folder.tracking, posed.tracking)
     write_trajectory(folder.tracked_poses, posed.tracking.trajectory)
+    if not posed.tracking.interrupted:
+        saver.save_tracking(posed.tracking)
     return posed, {"mode": poses.tracking, **posed.tracking.details}

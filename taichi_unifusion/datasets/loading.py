@@ -12,24 +12,24 @@ from .dataset import DatasetView
 from .live import Arriving
 
 
-def load_ahead(sequence: Sequence[Frame]) -> Iterator[Callable[[], Frame]]:
-    """Yield one function for each frame, in order: it returns the frame, or raises what loading
-    the frame raised. A thread loads the next frame meanwhile. Frames that are still to come are waited
-    for.
+def load_ahead(sequence: Sequence[Frame], start: int = 0) -> Iterator[Callable[[], Frame]]:
+    """Yield one function for each frame from `start`, in order: it returns the frame, or raises what
+    loading the frame raised. A thread loads the next frame meanwhile. Frames that are still to come
+    are waited for.
     """
     if isinstance(sequence, Arriving):
         yield from sequence.arriving()
         return
     # two threads must not launch kernels at once: load each frame in the caller's thread
     if getattr(recording_of(sequence), "runs_kernels", False):
-        yield from (partial(sequence.__getitem__, i) for i in range(len(sequence)))
+        yield from (partial(sequence.__getitem__, i) for i in range(start, len(sequence)))
         return
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="load") as pool:
         ahead = deque()
-        for i in range(len(sequence) + 1):
+        for i in range(start, len(sequence) + 1):
             if i < len(sequence):
                 ahead.append(pool.submit(sequence.__getitem__, i))
-            if i > 0:
+            if i > start:
                 yield ahead.popleft().result
 
 

@@ -61,3 +61,11 @@ def choose_voxel_size(sight: Sight | None, detail: Detail = "auto") -> float:
         fits = max(AT_ONE_METRE * sight.depth**EXPONENT, PIXELS * sight.footprint)
         size = min(STEPS, key=lambda step: abs(np.log(step / fits)))
     return TIMES[detail] * size
+
+
+def sizes_sentence(surface: float, color: float, sight: Sight) -> str:
+    """Which voxel sizes [m] were chosen, why, and how to choose others."""
+    return (
+        f"voxels of {100 * surface:g} cm, {100 * color:g} cm for colour: the first frames look "
+        f"{sight.depth:.2g} m far; detail (fine, coarse) or voxel_size choose others"
+    )

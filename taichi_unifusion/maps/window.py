@@ -257,13 +257,15 @@ class WindowFusion:
         self, size: int, keep: Keep | None = None, settle: Callable[[], None] = lambda: None
     ) -> None:
         self.size, self.keep, self.settle = size, keep, settle
+        self.at_border: Callable[[], None] | None = None  # told when all frames are in the maps
         self.window: Window | None = None
         self._last: Window | None = None  # the window of the last frame, which may be closed
         self.pieces: deque[Piece] = deque()
         self._begun: Piece | None = None  # that was handed out, and is not done
         self._rehearsals: list[Piece] = []  # for the first frame that has something for a part
         self._maps: set[RegressionMap] = set()  # that wait
-        self._index, self._stride = 0, 0  # of the last frame in its recording, and the usual step
+        # where windows end: the last frame's place in its recording, and the usual step
+        self.borders = (0, 0)
         self._room: dict[tuple[str, ...], tuple[CellArrays, Arena]] = {}
         self._known: dict[tuple[str, ...], Part] = {}
         self._images: list[DeviceArray] = []  # of the open window, and of the one before
@@ -275,6 +277,10 @@ class WindowFusion:
         if self.window is not None and not self._continues(self.window, frame):
             self.close()
         if self.window is None:
+            if self.at_border is not None:
+                self.run(len(self.pieces))
+                self._release()
+                self.at_border()
             return self._free_images(frame), 0
         return self.window.images, len(self.window)
 
@@ -306,9 +312,9 @@ class WindowFusion:
             self._rehearsals = [
                 Piece(" + ".join(names), partial(window.rehearse, names)) for names in new
             ]
-        if self._index and not self._stride:
-            self._stride = abs(frame.index - self._index)
-        self.window, self._last, self._index = window, window, frame.index
+        index, stride = self.borders
+        stride = stride or (index and abs(frame.index - index))
+        self.window, self._last, self.borders = window, window, (frame.index, stride)
         for part in parts:
             for each in part.maps:
                 each.waiting = self
@@ -386,7 +392,8 @@ class WindowFusion:
             self._maps.clear()
 
     def _continues(self, window: Window, frame: Frame) -> bool:
-        gap = self._stride and abs(frame.index - self._index) > GAP * self._stride
+        index, stride = self.borders
+        gap = stride and abs(frame.index - index) > GAP * stride
         same = frame.carried == window.carried and window.has_room_for(frame)
         return not gap and same and window.is_near(frame)
 

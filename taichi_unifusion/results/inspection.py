@@ -14,6 +14,7 @@ from ..maps.stored import read_stored
 from .lock import who_writes
 from .record import Source, read_record
 from .run_folder import RunFolder
+from .safe_point import read_state
 from .summary import count_frames, describe_origin, describe_up
 from .tables import format_bytes, format_table
 
@@ -38,6 +39,7 @@ def inspect(path: Path) -> Inspection:
     if path.is_dir() and not TileFolder.is_one(path):
         folder = RunFolder(path)
         maps, mesh, record = list(folder.maps.values()), folder.mesh, folder.record
+        maps += folder.safe_maps
         if not (maps or mesh.exists() or record.exists()):
             raise FileError(
                 f"{path}: holds no results; expected {folder.relative(folder.map('*'))}, {mesh.name} or {record.name}"
@@ -64,6 +66,7 @@ def inspect(path: Path) -> Inspection:
         attempt(_describe_run, record),
     ]
     if path.is_dir():
+        texts += [attempt(_describe_unfinished, RunFolder(path).state)]
         texts.append(_describe_writer(RunFolder(path)))
         problems += _find_mixed(RunFolder(path))
     return Inspection("\n\n".join(text for text in texts if text), tuple(problems))
@@ -91,6 +94,17 @@ def _size(file: Path) -> str:
     if not TileFolder.is_one(file):
         return size
     return f"{size} in {len(TileFolder.open(file).tiles)} tiles"
+
+
+def _describe_unfinished(file: Path) -> str | None:
+    """How far a run was that is not done."""
+    folder = RunFolder(file.parents[1])
+    if (state := read_state(folder)) is None:
+        return None
+    return (
+        f"ended   {state.done} of {state.recipe.recording.frames} frames are safe in "
+        f"{folder.relative(folder.unfinished)}/: the same command with --resume goes on from there"
+    )
 
 
 def _describe_writer(folder: RunFolder) -> str | None:

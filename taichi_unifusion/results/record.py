@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from ..errors import FileError, InputError, convert, shortened
 from ..files.atomic import read_bytes, write_text
 from ..files.json_text import parse_json
+
+D = TypeVar("D")
 
 UNFINISHED = "unfinished"  # stands in a file that is there while a run writes
 SCHEMA_VERSION = 1  # files without a number are older, and are read as version 1
@@ -215,6 +217,11 @@ def read_record(path: Path) -> RunRecord:
         return RunRecord.from_json(values)
     except InputError as error:
         raise FileError(f"{path}: {error}") from None
+
+
+def decoded(wanted: type[D], values: Any) -> D:
+    """JSON values as a frozen dataclass; raises InputError that names what does not fit."""
+    return _decode(wanted, values, "")
 
 
 def _decode(wanted: Any, value: Any, at: str) -> Any:

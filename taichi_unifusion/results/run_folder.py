@@ -154,6 +154,50 @@ class RunFolder:
         return self.path / f"part-{number}.ply"
 
     @property
+    def unfinished(self) -> Path:
+        """Where safe points of a run lie that is not done."""
+        return self.path / "unfinished"
+
+    @property
+    def state(self) -> Path:
+        """What the last safe point is."""
+        return self.unfinished / "state.json"
+
+    @property
+    def journal(self) -> Path:
+        """What the run did, a line a frame."""
+        return self.unfinished / "steps.jsonl"
+
+    @property
+    def tracking_state(self) -> Path:
+        """The poses that a tracker found, as a run needs them that goes on."""
+        return self.unfinished / "tracking.json"
+
+    def generation(self, number: int) -> Path:
+        """Where the maps of a safe point lie."""
+        return self.unfinished / f"generation-{number}"
+
+    @property
+    def generations(self) -> tuple[Path, ...]:
+        """The safe points whose maps are there, maybe not all of them."""
+        return tuple(self.unfinished.glob("generation-*"))
+
+    @property
+    def safe_maps(self) -> tuple[Path, ...]:
+        """The maps of safe points."""
+        return tuple(
+            file for each in self.generations for file in sorted(each.glob(self.map("*").name))
+        )
+
+    def config_in(self, generation: Path) -> Path:
+        """The settings of a safe point."""
+        return generation / self.config.name
+
+    def map_in(self, generation: Path, name: str) -> Path:
+        """A map of a safe point."""
+        return generation / self.map(name).name
+
+    @property
     def lock(self) -> Path:
         """Says who writes into the folder now."""
         return self.path / "run.lock"
@@ -206,9 +250,8 @@ class RunFolder:
     @property
     def temporaries(self) -> tuple[Path, ...]:
         """What writing leaves behind where the process is ended at once."""
-        return tuple(
-            file for folder in (self.path, self.map_folder) for file in folder.glob(".*.tmp")
-        )
+        folders = (self.path, self.map_folder, self.unfinished, *self.generations)
+        return tuple(file for folder in folders for file in folder.glob(".*.tmp"))
 
     def relative(self, file: Path) -> str:
         """The name of a file in messages and records: relative to the folder."""

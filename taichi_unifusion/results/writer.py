@@ -77,13 +77,6 @@ def check_free(folder: RunFolder, config: Config, features: bool, tracked: bool)
         )
 
 
-def remove_temporaries(folder: RunFolder) -> None:
-    """Remove the unfinished files that a process leaves which is ended at once."""
-    for path in folder.temporaries:
-        with suppress(OSError):
-            path.unlink()
-
-
 def write_results(
     directory: str | Path,
     pipeline: Pipeline,

@@ -27,6 +27,7 @@ from ..results.outlook import find_mesh_up, read_up
 from ..results.property_files import recorded_looks
 from ..results.reader import Run, read_run
 from ..results.run_folder import RunFolder
+from ..results.safe_point import mesh_of_safe_point
 from ..types import Mesh, PinholeCamera
 from .answers import relevance_layer
 from .scene import Layer, Scene, SceneCamera, SceneMesh
@@ -57,12 +58,16 @@ def open_scene(path: str | Path, options: SceneOptions | None = None) -> Scene:
     if not path.exists():
         raise FileError(f"{path}: no such file or folder")
     folder = RunFolder(path) if path.is_dir() else None
-    if folder is not None and not folder.mesh.exists():
+    source = path if folder is None else folder.mesh
+    if folder is None or folder.mesh.exists():
+        mesh = read_any_mesh(source)
+    elif (unfinished := mesh_of_safe_point(folder)) is not None:
+        mesh = unfinished
+    else:
         raise FileError(
             f"{folder.mesh}: no such file; give a results folder, or make its mesh with: unifusion mesh {path}"
         )
-    source = path if folder is None else folder.mesh
-    mesh = check_mesh(read_any_mesh(source), str(source))
+    mesh = check_mesh(mesh, str(source))
     bare = Scene(path.name or str(path), (), T_up_world=up_of(folder, mesh))
     layers = layers_of(mesh, folder, bare, options.compare)
     cameras = () if folder is None else _cameras(folder, options)

@@ -1,0 +1,121 @@
+"""Kill -9 at random moments: a run that is killed again and again and resumed has to end in the very
+map of an undisturbed one.
+
+    python benchmarks/kill.py --kills 100
+
+Each process gets `--resume` and dies after a random time, until one comes through; then the next run
+begins. Prints how often, where it was, what was found, and what safe points cost.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from taichi_unifusion.results import RunFolder, inspect
+
+PROGRAM = """
+import sys
+from taichi_unifusion.results import saver
+saver.SHARE = float(sys.argv.pop(1))
+from taichi_unifusion.cli.start import main
+sys.exit(main())
+"""
+EAGER = "0.5"  # share of the time for safe points while processes are killed
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to kill, and how often."""
+
+    kills: int = 100
+    """How many processes are killed."""
+    frames: int = 40
+    """Frames of the synthetic room that a run has."""
+    seed: int = 0
+    """Of the moments."""
+
+
+def command(out: Path, options: Options, *more: str, share: str = EAGER) -> list[str]:
+    return [
+        *(sys.executable, "-c", PROGRAM, share, "reconstruct", "synthetic"),
+        *("--option", "width=160", "--option", "height=120", "--end", str(options.frames)),
+        *("--device", "cpu", "--threads", "1", "--window", "4", "--surface.voxel-size", "0.1"),
+        *("--color.voxel-size", "0.05", "--out", str(out), *more),
+    ]
+
+
+def run(arguments: list[str], after: float | None = None) -> tuple[int, str]:
+    """Exit code and messages of a process, killed after so many seconds."""
+    process = subprocess.Popen(
+        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        said = process.communicate(timeout=after)[1]
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGKILL)
+        said = process.communicate()[1]
+    return process.returncode, said
+
+
+def contents(folder: RunFolder) -> dict[str, bytes]:
+    files = [*folder.maps.values(), folder.mesh]
+    return {file.name: file.read_bytes() for file in files}
+
+
+def moment_of(folder: RunFolder, said: str) -> str:
+    """Where a process was when it was killed."""
+    if folder.record.exists():
+        return "writing the results"
+    if any(folder.unfinished.glob("generation-*/.*.tmp")) or len(folder.generations) > 1:
+        return "making a safe point"
+    return "fusing frames" if "compiling kernels" in said else "starting"
+
+
+def main(options: Options) -> int:
+    """Kill and resume until there were so many kills; 1 if any run ended otherwise."""
+    place = Path(tempfile.mkdtemp(prefix="unifusion-kill-"))
+    chance, wrong, moments, finished, kills = random.Random(options.seed), [], Counter(), 0, 0
+    try:
+        began = time.monotonic()
+        code, said = run(command(place / "whole", options, "--save-every", "0"))
+        assert code == 0, said
+        took = time.monotonic() - began
+        expected = contents(RunFolder(place / "whole"))
+        folder = RunFolder(place / "killed")
+        while kills < options.kills:
+            arguments = command(folder.path, options, "--save-every", "0.05", "--resume")
+            code, said = run(arguments, chance.uniform(0.1, 1.0) * took)
+            if code == -signal.SIGKILL:
+                kills += 1
+                moments[moment_of(folder, said)] += 1
+                continue
+            finished += 1
+            left = [*folder.path.rglob("*.tmp"), *folder.path.glob("unfinished"), folder.lock]
+            problems = [file for file in left if file.exists()]
+            if code or problems or inspect(folder.path).problems or contents(folder) != expected:
+                wrong.append((code, problems, re.sub(r"\s+", " ", said)[-400:]))
+            shutil.rmtree(folder.path)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+    print(f"{kills} kills, {finished} runs came through, {len(wrong)} of them not as undisturbed")
+    for moment, count in moments.most_common():
+        print(f"  {count:4d} {moment}")
+    for each in wrong:
+        print(" ", *each)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, description=__doc__)))

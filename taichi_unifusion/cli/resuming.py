@@ -1,0 +1,141 @@
+"""`--resume`: a run that was ended goes on from its last safe point."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import TYPE_CHECKING, Protocol
+
+from ..config import Config, dump_config, load_config
+from ..datasets import Dataset
+from ..errors import FileError, InputError
+from ..results.record import ColorRecord, read_record
+from ..results.run_folder import RunFolder
+from .color_camera import found_color
+from .options import OutputOptions, RecordingOptions, TrackingOptions, source_of
+
+if TYPE_CHECKING:
+    from ..networks.encoders import ImageEncoder
+    from ..pipeline import Pipeline
+    from ..results.saver import RunSaver
+
+logger = logging.getLogger(__name__)
+
+
+class RunOptions(Protocol):
+    """What decides what a run does."""
+
+    @property
+    def recording(self) -> RecordingOptions: ...
+    @property
+    def poses(self) -> TrackingOptions: ...
+    @property
+    def output(self) -> OutputOptions: ...
+    @property
+    def settings(self) -> Config: ...
+
+
+def open_saver(
+    frames: int, options: RunOptions, folder: RunFolder, encoder: ImageEncoder | None
+) -> RunSaver:
+    """What makes safe points of a run, and knows the one to go on from; raises InputError where
+    that belongs to a run of other options.
+    """
+    from ..results.safe_point import Recipe
+    from ..results.saver import RunSaver
+
+    output, poses = options.output, options.poses
+    if not output.save_every >= 0:
+        raise InputError(f"--save-every: seconds must be 0 or more, got {output.save_every:g}")
+    tiled = bool(options.settings.map_memory)
+    if tiled and output.resume:
+        raise InputError("--resume: maps in tiles, as --map-memory keeps them, cannot go on yet")
+    recipe = Recipe(
+        config=dump_config(options.settings),
+        recording=source_of(options.recording, frames),
+        poses={
+            "tracking": poses.tracking,
+            "trajectory": str(poses.trajectory or ""),
+            "interpolate": poses.interpolate,
+        },
+        color_camera=options.recording.color_camera,
+        features=encoder.name if encoder else "",
+    )
+    seconds = 0.0 if tiled else output.save_every
+    saver = RunSaver(folder, recipe, seconds, resume=output.resume)
+    if saver.resumed is not None:
+        state = saver.resumed.state
+        logger.info("going on after %d of %d frames", state.done, frames)
+    elif output.resume:
+        logger.info(
+            "%s holds no safe point: %s",
+            folder.path,
+            "its poses are used, the map begins anew" if saver.tracked else "the run begins anew",
+        )
+    return saver
+
+
+def is_complete(folder: RunFolder, frames: int, options: RunOptions) -> bool:
+    """Whether a folder holds the whole run already that is to go on."""
+    if not options.output.resume or folder.unfinished.exists():
+        return False
+    try:
+        record, used = read_record(folder.record), load_config(folder.config)
+    except (FileError, InputError):
+        return False
+    done, source, wanted = record.frames, record.recording, options.settings
+    settled = replace(wanted, voxel_size=wanted.voxel_size or used.voxel_size).settled(())
+    mode = record.tracking["mode"] if record.tracking else "given"
+    asked = source_of(options.recording, frames, source and source.color)
+    return (
+        source == asked
+        and settled == used
+        and mode == options.poses.tracking
+        and not (done.interrupted or record.errors)
+        and done.used + done.skipped == frames
+    )
+
+
+def registered(
+    recording: Dataset, color: ColorRecord, saver: RunSaver
+) -> tuple[Dataset, ColorRecord]:
+    """The recording with its colour camera, which is looked for but once in a run."""
+    known = saver.resumed.state.recording.color if saver.resumed else None
+    if known is None or known.camera is None:
+        return found_color(recording, color)
+    from ..results.reader import registered_as
+
+    logger.info("colour: %s", known.verdict)
+    return registered_as(recording, known), known
+
+
+def make_pipeline(
+    options: RunOptions, encoder: ImageEncoder | None, folder: RunFolder, saver: RunSaver
+) -> Pipeline:
+    """The pipeline of a run, with the maps of the safe point that it goes on from."""
+    from .. import runtime
+    from ..pipeline import Pipeline
+    from ..results.safe_point import read_maps, read_settings
+
+    if saver.resumed is None:
+        return Pipeline(options.settings, encoder=encoder, tiles=folder.map_folder)
+    settings = options.settings
+    runtime.init(settings.device, threads=settings.threads or None)
+    state = saver.resumed.state
+    pipeline = Pipeline(
+        read_settings(folder, state), encoder=encoder, maps=read_maps(folder, state)
+    )
+    pipeline.fusion.borders = state.borders
+    return pipeline
+
+
+def end_saving(folder: RunFolder, done: bool) -> None:
+    """Remove the safe points of a run that is done, or say that it can go on."""
+    from ..results.safe_point import read_state, remove_safe_point
+
+    if done:
+        remove_safe_point(folder)
+    elif (state := read_state(folder)) is not None:
+        logger.info(
+            "%d frames are safe: the same command with --resume goes on from there", state.done
+        )
