@@ -22,7 +22,7 @@ from .errors import FrameError, InputError, as_known
 from .kernels.patches import Patches
 from .language.source import FeatureSource
 from .maps import BaseMap, FeatureMap, Integration, PropertyMap, SurfaceMap
-from .maps.detail import Sight, sight_of, sizes_sentence
+from .maps.detail import sight_of, sizes_sentence
 from .maps.follower import MapFollower
 from .maps.kept_window import KeptWindow
 from .maps.property_group import group_maps
@@ -70,8 +70,7 @@ class PropertySource(Source, Protocol):
     def make_map(self, frame: Frame | None = None) -> BaseMap: ...
 
 
-# is told between two windows what the run did until then, and the pipeline
-OnBorder = Callable[[RunLog, "Pipeline"], None]
+OnBorder = Callable[[RunLog, "Pipeline"], None]  # is told between two windows
 # is told of a frame that was fused, what that did, and the pipeline
 OnStep = Callable[[Frame, StepResult, "Pipeline"], None]
 
@@ -88,8 +87,7 @@ class Pipeline:
     them. `keep` is told of every window that was fused. Where it is a `WindowStore`, the maps can
     follow a trajectory that changes: `pipeline.follower`. With `map_memory` in the configuration,
     maps are kept within it; what does not fit lies in the folder `tiles`, a folder a map, and
-    `extract_mesh` goes through all of it. `maps` by name, of the same settings,
-    which must be settled, are gone on with.
+    `extract_mesh` goes through all of it. `maps` of these settings, by name, are gone on with.
     """
 
     def __init__(
@@ -136,7 +134,7 @@ class Pipeline:
             if sight is None:
                 return False
             self._make_maps(self.config.settled(frames))
-            logger.info("%s", sizes_sentence(self.config.surface.voxel_size, self.config.color.voxel_size, sight))
+            logger.info("%s", sizes_sentence(self.config.surface, self.config.color, sight))
         return True
 
     def _make_maps(self, config: Config) -> None:
@@ -308,16 +306,15 @@ class Pipeline:
 
         `stop` is asked before every frame, `on_frame` told after it how many there were, `on_step`
         after each that was fused what it did, `on_skip` which one was not used and why: there a
-        viewer can look at the maps. `on_border` is told between two windows, when all frames so far are in
-        the maps; with what the run did until then as `before`, and the maps and `fusion.borders` of
-        that moment, another pipeline goes on, and ends as if nothing had stopped it. What ends a run
+        viewer can look at the maps. `on_border` is told between two windows, when all frames so far
+        are fused; with what the run did until then as `before`, and the maps and `fusion.borders` of
+        that moment, another pipeline goes on and ends as if nothing had happened. What ends a run
         early, an error of any kind too, is in the result, with all that was done until then; raises
         it, or DatasetError, only where not one frame could be used.
         """
         self.settle(first_frames(sequence, stop) if not self._maps else ())
         log, failure, interrupted = RunLog(sequence, self.config.preprocess, before), None, False
-        if on_border is not None:
-            self.fusion.at_border = lambda: on_border(log, self)
+        self.fusion.at_border = on_border and (lambda: on_border(log, self))
         for i, load in enumerate(load_ahead(sequence, log.done), log.done):
             if interrupted := stop():
                 break

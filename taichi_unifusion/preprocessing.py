@@ -294,17 +294,3 @@ def _column(use: str, frame: Frame) -> DeviceArray:
     return runtime.current().arena.exact(
         f"patches: {use}", lambda: ti.ndarray(ti.i32, shape), shape
     )
-
-
-def why_empty(frame: Frame, settings: PreprocessSettings) -> str:
-    """Why nothing of a frame's depth can be used, in words."""
-    readings = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
-    if not len(readings):
-        return "the depth image holds no reading at all"
-    if not ((readings >= settings.depth_min) & (readings <= settings.depth_max)).any():
-        return (
-            f"all depth readings lie outside {settings.depth_min:g}..{settings.depth_max:g} m "
-            f"(median {np.median(readings):.3g} m); is the depth scale wrong? "
-            "Else see preprocess.depth_min and depth_max"
-        )
-    return f"all {len(readings)} depth readings lie on edges, on grazing surfaces or too far apart"

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..types import Frame
+from .settings import MapSettings
 
 Detail = Literal["auto", "fine", "coarse"]
 
@@ -63,9 +64,9 @@ def choose_voxel_size(sight: Sight | None, detail: Detail = "auto") -> float:
     return TIMES[detail] * size
 
 
-def sizes_sentence(surface: float, color: float, sight: Sight) -> str:
-    """Which voxel sizes [m] were chosen, why, and how to choose others."""
+def sizes_sentence(surface: MapSettings, color: MapSettings, sight: Sight) -> str:
+    """Which voxel sizes were chosen, why, and how to choose others."""
     return (
-        f"voxels of {100 * surface:g} cm, {100 * color:g} cm for colour: the first frames look "
+        f"voxels of {100 * surface.voxel_size:g} cm, {100 * color.voxel_size:g} cm for colour: the first frames look "
         f"{sight.depth:.2g} m far; detail (fine, coarse) or voxel_size choose others"
     )
