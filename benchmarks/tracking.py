@@ -21,14 +21,17 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import tracking_peers as peers
 
 import taichi_unifusion as uf
+from taichi_unifusion.datasets.loading import index_in_recording
+from taichi_unifusion.evaluation.rendering import evaluate_rendering
 from taichi_unifusion.evaluation.trajectory import evaluate_trajectory
 from taichi_unifusion.geometry import se3
 from taichi_unifusion.results.tables import format_table
@@ -44,7 +47,12 @@ COMMON = 0.25  # share of a frame that must be seen by both
 DISTURBANCE = 0.03, np.radians(2.0)  # [m, rad] at most
 BACK = 0.003, np.radians(0.2)  # what counts as found back
 WARM_UP = 3  # frames
-HEADER = ["method", "tracked", "ATE cm", "end cm", "RPE cm", "agree %", "median ms", "mean ms"]
+HEADER = [
+    *("method", "tracked", "ATE cm", "end cm", "RPE cm", "agree %", "map cm", "map median"),
+    *("median ms", "mean ms"),
+]
+MAPPED = 10  # the map is made of every so many frames ...
+JUDGED = 5  # ... and judged by the frame so many after each of them
 
 
 class Ours:
@@ -88,6 +96,42 @@ def agreement(pyramids: dict, poses: dict[int, np.ndarray]) -> str:
     return f"{100 * np.mean(shares):.1f}" if shares else "-"
 
 
+def map_error(
+    frames: uf.datasets.Dataset, poses: Mapping[int, np.ndarray | None]
+) -> tuple[float | None, float | None]:
+    """Mean and median error [cm] of a map of every tenth frame at these poses, judged by the depth
+    of frames left out; None where there are too few.
+    """
+    kept = [i for i in range(0, len(frames), MAPPED) if poses.get(i) is not None]
+    left_out = [i for i in range(JUDGED, len(frames), MAPPED) if poses.get(i) is not None]
+    if not kept or not left_out:
+        return None, None
+
+    def posed(index: int) -> uf.Frame:
+        return replace(frames[index], T_world_camera=poses[index], color=None)
+
+    pipeline = uf.Pipeline()
+    pipeline.run([posed(i) for i in kept])
+    result = evaluate_rendering(pipeline.extract_mesh(), (posed(i) for i in left_out))
+    return result.depth_l1_cm, result.depth_median_cm
+
+
+def trajectory_error(
+    poses: Mapping[int, np.ndarray], truth: Mapping[int, np.ndarray | None]
+) -> tuple[float | None, float | None]:
+    """ATE and RPE [cm] of the frames that both have; None for fewer than three."""
+    found = [index for index in poses if truth[index] is not None]
+    if len(found) < 3:
+        return None, None
+    result = evaluate_trajectory(
+        *(
+            Trajectory(np.array(found, float), np.array([source[index] for index in found]))
+            for source in (poses, truth)
+        )
+    )
+    return result.ate_cm.rmse, result.rpe_translation_cm.rmse
+
+
 class Run:
     """One method on its way through the frames: one row of the table."""
 
@@ -99,30 +143,37 @@ class Run:
         self.method.track(frame)
         self.laps.append(1e3 * (time.process_time() - start))
 
-    def row(self, truth: dict, pyramids: dict) -> list[str]:
+    def row(self, truth: dict, pyramids: dict, frames: uf.datasets.Dataset) -> list[str]:
         start = time.process_time()
         poses = self.method.finish()
         total = sum(self.laps) + 1e3 * (time.process_time() - start)
         counted = [self.name, f"{len(poses)} of {len(truth)}"]
         times = [f"{np.median(self.laps):.0f}", f"{total / len(self.laps):.0f}"]
+        ate, rpe = trajectory_error(poses, truth)
+        if ate is None or rpe is None:
+            return [*counted, *["-"] * 6, *times]
         found = [index for index in poses if truth[index] is not None]
-        if len(found) < 3:
-            return [*counted, *["-"] * 4, *times]
-        estimate, given = (
-            np.array([source[index] for index in found]) for source in (poses, truth)
-        )
-        result = evaluate_trajectory(
-            *(Trajectory(np.array(found, float), T) for T in (estimate, given))
-        )
-        last, _ = se3.distance(*(se3.inverse(T[0]) @ T[-1] for T in (estimate, given)))
+        first, end = found[0], found[-1]
+        last, _ = se3.distance(*(se3.inverse(T[first]) @ T[end] for T in (poses, truth)))
         return [
             *counted,
-            f"{result.ate_cm.rmse:.2f}",
+            f"{ate:.2f}",
             f"{100 * last:.2f}",
-            f"{result.rpe_translation_cm.rmse:.2f}",
+            f"{rpe:.2f}",
             agreement(pyramids, poses),
+            *_shown(map_error(frames, _by_place(poses, frames))),
             *times,
         ]
+
+
+def _by_place(poses: Mapping, frames: uf.datasets.Dataset) -> dict[int, np.ndarray]:
+    """Poses by the frame's place in what is tracked, where they go by its place in the recording."""
+    places = {index_in_recording(frames, i): i for i in range(len(frames))}
+    return {places[index]: T for index, T in poses.items()}
+
+
+def _shown(values: Sequence[float | None]) -> list[str]:
+    return ["-" if value is None else f"{value:.2f}" for value in values]
 
 
 def compare(names: Sequence[str], frames: uf.datasets.Dataset) -> list[list[str]]:
@@ -142,10 +193,11 @@ def compare(names: Sequence[str], frames: uf.datasets.Dataset) -> list[list[str]
         f"{len(truth)} of {len(truth)}",
         *["-"] * 3,
         agreement(pyramids, truth),
+        *_shown(map_error(frames, _by_place(truth, frames))),
         "-",
         "-",
     ]
-    return [*(run.row(truth, pyramids) for run in runs), given]
+    return [*(run.row(truth, pyramids, frames) for run in runs), given]
 
 
 def warm_up(names: Sequence[str], frames: uf.datasets.Dataset) -> None:

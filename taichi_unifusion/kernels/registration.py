@@ -9,7 +9,7 @@ that the result does not depend on the order in which threads run.
 
 import taichi as ti
 
-from .arrays import Bytes3, Floats2, Floats3
+from .arrays import Bytes2, Bytes3, Floats2, Floats3
 from .camera import Intrinsics, Pose, lift, project
 
 # of a surfel image; 8 numbers fill half a cache line
@@ -30,6 +30,8 @@ FREEDOM = 5.0  # degrees of freedom of the residuals' t distribution (Kerl et al
 # [1/px] smallest slope of intensity that counts; flatter ones are mostly noise, which would look like
 # texture on a blank wall
 LEAST_SLOPE = 0.012
+COMPARED = 3  # numbers of a compared pixel, see `compare_pixel`
+UNSEEN = 1e9  # the first of them where there is nothing to compare with
 NEAR = 0.05  # [m] points nearer to the target camera are not projected
 
 
@@ -273,3 +275,70 @@ def sum_normal_equations(
                         )
             for k in range(SUMS):
                 sums[block, k] = total[k]
+
+
+@ti.kernel
+def leave_out(
+    # in:
+    moving: Bytes2,  # (h, w) not 0: belongs to something that moves; of any size
+    # in and out:
+    surfels: Floats3,  # (H, W, CHANNELS) a depth below 0 is one that is left out
+):
+    for v, u in ti.ndrange(surfels.shape[0], surfels.shape[1]):
+        i, j = v * moving.shape[0] // surfels.shape[0], u * moving.shape[1] // surfels.shape[1]
+        depth = ti.abs(surfels[v, u, DEPTH])
+        surfels[v, u, DEPTH] = -depth if moving[i, j] != 0 else depth
+
+
+@ti.func
+def compare_pixel(
+    source: ti.template(),
+    v: ti.i32,
+    u: ti.i32,
+    target: ti.template(),
+    K_source: ti.template(),
+    K_target: ti.template(),
+    R: ti.template(),
+    t: ti.template(),
+):
+    """How far a source surfel lies in front of the surface that the target saw where it projects to
+    [standard deviations], by how much it is darker, and the difference that a shift of a pixel makes;
+    UNSEEN where the target says nothing.
+    """
+    found = ti.Vector([UNSEEN, 0.0, 0.0])
+    z = ti.abs(source[v, u, DEPTH])
+    p = R @ lift(u, v, z, K_source) + t
+    x, y = -1.0, -1.0
+    if z > 0 and p[2] > NEAR:
+        x, y = project(p, K_target)
+    if x >= 0 and y >= 0 and x <= target.shape[1] - 1 and y <= target.shape[0] - 1:
+        j, i = ti.cast(x + 0.5, ti.i32), ti.cast(y + 0.5, ti.i32)
+        depth = target[i, j, DEPTH]
+        if depth > 0:
+            n = ti.Vector([target[i, j, NORMAL + d] for d in range(3)])
+            r = n.dot(p - lift(j, i, depth, K_target))
+            along_u, along_v = target[i, j, SLOPE_U], target[i, j, SLOPE_V]
+            there = target[i, j, INTENSITY] + along_u * (x - j) + along_v * (y - i)
+            found[0] = r / ti.sqrt(axial_variance(depth) + axial_variance(z))
+            found[1] = there - source[v, u, INTENSITY]
+            found[2] = ti.abs(along_u) + ti.abs(along_v)
+    return found
+
+
+@ti.kernel
+def compare_surfels(
+    # in:
+    source: Floats3,  # (h, w, CHANNELS) surfels that are left out are compared too
+    target: Floats3,  # (H, W, CHANNELS)
+    K_source: Intrinsics,
+    K_target: Intrinsics,
+    T_target_source: Pose,
+    step: ti.i32,  # every step-th pixel of every step-th row of the source is compared
+    # out:
+    compared: Floats3,  # (h / step, w / step, COMPARED) as `compare_pixel` says
+):
+    R, t = T_target_source[:3, :3], T_target_source[:, 3]
+    for v, u in ti.ndrange(compared.shape[0], compared.shape[1]):
+        found = compare_pixel(source, v * step, u * step, target, K_source, K_target, R, t)
+        for k in ti.static(range(COMPARED)):
+            compared[v, u, k] = found[k]

@@ -18,6 +18,7 @@ EXPECTED_OVERLAP = 0.3  # overlap, by the poses as they are, from which on a pai
 # What an alignment of two keyframes must reach to become an edge; stricter than for a frame
 LOOP_OVERLAP, LOOP_AGREEMENT = 0.25, 0.75
 LOOP_UNCERTAINTY = 0.02  # [m] of the translation in its weakest direction
+DRIFT = 0.5, 0.1  # [m], share of the way: a place that looks alike is another one beyond it
 LOOP_CORRECTION = 0.3, np.radians(15)  # [m, rad] a result farther from its guess is wrong
 
 
@@ -47,11 +48,23 @@ def find_loops(
         features = keyframes.items[number].features
         for other in most_similar(features, [keyframes.items[k].features for k in older], LOOPS):
             guess = locate(features, keyframes.items[other].features)
-            if guess is not None and (
-                edge := _edge(keyframes, other, number, photometric_weight, guess, loop=True)
+            if (
+                guess is not None
+                and _reachable(keyframes, other, number, guess)
+                and (edge := _edge(keyframes, other, number, photometric_weight, guess, loop=True))
             ):
                 edges.append(edge)
     return edges
+
+
+def _reachable(keyframes: Keyframes, other: int, number: int, T_other_number: NDArray) -> bool:
+    """Whether drift on the way from one keyframe to the other explains that they look alike; a
+    corridor that repeats itself does so, too.
+    """
+    T_world_keyframe = np.array(keyframes.T_world_keyframe[other : number + 1])
+    way = np.linalg.norm(np.diff(T_world_keyframe[:, :3, 3], axis=0), axis=1).sum()
+    drift, _ = se3.distance(T_other_number, se3.inverse(T_world_keyframe[0]) @ T_world_keyframe[-1])
+    return bool(drift < DRIFT[0] + DRIFT[1] * way)
 
 
 def _by_overlap(keyframes: Keyframes, number: int, others: range) -> list[int]:

@@ -19,13 +19,18 @@ from .keyframes import Keyframe, Keyframes
 from .loop_closure import find_loops, neighbor_edges
 from .pose_graph import Edge, Prior, optimize
 from .pyramid import ReducedFrame, SurfelPyramid, build_pyramid, reduce_frame
-from .registration import Registration, Target, register
+from .registration import Registration, Target
+from .static_part import MOST_MOVING, SOME_MOVING, register_static, without_left_out
 
 MIN_SURFELS = 0.03  # smallest share of the image with usable depth that can be aligned
 # An alignment of a frame to its keyframe is trusted from these shares on: of the frame that meets
 # the keyframe, and of that part that lies on the keyframe's surface (right ones have 0.84 to 0.98).
 FRAME_OVERLAP, FRAME_AGREEMENT = 0.25, 0.65
 SURE_AGREEMENT = 0.8  # the same after a loss, when the camera may be far from where it was
+# of a frame that nothing contradicts: noise, glass and edges are not held against it
+FEW_MOVING, LEAST_AGREEMENT = 0.03, 0.5
+# [m, rad] farther from where the camera was expected, little may contradict
+JUMP = 0.1, np.radians(7)
 FRAME_CORRECTION = 0.3, np.radians(20)  # [m, rad] a result farther from its guess is wrong
 
 
@@ -59,6 +64,7 @@ class Placement:
     tracked: TrackedFrame
     keyframe: int | None = None  # number among the keyframes; None: the frame has no pose
     T_keyframe_camera: NDArray[np.float64] | None = None  # (4, 4)
+    registration: Registration | None = None  # that it was aligned by
 
 
 class KeyframeOdometry:
@@ -88,18 +94,35 @@ class KeyframeOdometry:
         T_world_camera: NDArray,
         window: int = 1,
         agreement: float = FRAME_AGREEMENT,
+        expected: NDArray | None = None,
     ) -> tuple[Registration, str]:
         """The frame relative to the reference keyframe, from the guess `T_world_camera`, and why
-        the result cannot be trusted; empty if it can.
+        the result cannot be trusted; empty if it can. `expected` is where a motion that was observed
+        takes the camera.
         """
         poses, newest = self.keyframes.T_world_keyframe, self.reference
+        T_newest_world = se3.inverse(poses[newest])
         targets = [
             Target(self.keyframes.pyramid(k), se3.inverse(poses[k]) @ poses[newest])
             for k in range(max(0, newest - window + 1), newest + 1)
         ]
-        guess = se3.inverse(poses[newest]) @ T_world_camera
-        found = register(prepared.pyramid, targets, guess, self.settings.photometric_weight)
-        return found, problem_of(found, guess, agreement)
+        guess = T_newest_world @ T_world_camera
+        found, compared = register_static(
+            prepared.pyramid,
+            targets,
+            guess,
+            self.settings.photometric_weight,
+            expected=expected is not None,
+        )
+        if expected is not None and compared.contradicted < FEW_MOVING:
+            agreement = min(agreement, LEAST_AGREEMENT)
+        problem = problem_of(found, guess, agreement)
+        from_there = guess if expected is None else T_newest_world @ expected
+        distance, angle = se3.distance(from_there, found.T_target_source)
+        jump = distance > JUMP[0] or angle > JUMP[1]
+        if not problem and compared.contradicted > (SOME_MOVING if jump else MOST_MOVING):
+            problem = f"{compared.contradicted:.0%} of what it sees has moved"
+        return found, problem
 
     def add_keyframe(
         self, prepared: PreparedFrame, T_world_camera: NDArray, registration: Registration | None
@@ -107,7 +130,8 @@ class KeyframeOdometry:
         """Make the frame a keyframe and the new reference; `registration` is its alignment to the
         reference before it. Returns its number.
         """
-        keyframe = Keyframe(prepared.frame.index, prepared.reduced, prepared.features)
+        reduced = without_left_out(prepared.reduced, prepared.pyramid)
+        keyframe = Keyframe(prepared.frame.index, reduced, prepared.features)
         before = self.reference
         number = self.keyframes.add(keyframe, prepared.pyramid, T_world_camera)
         if registration is not None:
@@ -175,7 +199,7 @@ class KeyframeOdometry:
             message=message,
             **fit,
         )
-        self.placements.append(Placement(tracked, keyframe, T_keyframe_camera))
+        self.placements.append(Placement(tracked, keyframe, T_keyframe_camera, registration))
         return tracked
 
     def give_up(

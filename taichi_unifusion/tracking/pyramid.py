@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
+from ..runtime import DeviceArray
 from ..types import Frame, PinholeCamera
-
-if TYPE_CHECKING:
-    import taichi as ti
 
 # [px] wider images are averaged to at least this width; finer ones add time and noise, no accuracy
 FINEST_WIDTH = 320
@@ -39,7 +36,7 @@ class SurfelImage:
     camera of its pixels.
     """
 
-    surfels: ti.Ndarray
+    surfels: DeviceArray
     camera: PinholeCamera
 
 

@@ -7,6 +7,7 @@ drift. A frame that fits nowhere gets no pose; the next ones are relocalised by 
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -25,13 +26,23 @@ from .base import (
     Verdict,
 )
 from .features import locate, most_similar
+from .fixed_part import FixedPart, without
 from .loop_closure import believable
 from .odometry import FRAME_AGREEMENT, SURE_AGREEMENT, KeyframeOdometry, Placement, PreparedFrame
 from .registration import Registration, register
 
+REACH, FASTEST = 0.3, 0.15  # [m], [m a frame] a camera is not faster than
+NOT_LOADED = Verdict.UNREADABLE, Verdict.MISSING
+FIXED = (
+    "tracking: %.0f%% of the image is fixed to the camera (a part of what carries it?) and is left out of "
+    "tracking; leave it out of the map with --preprocess.depth-min, or without those readings in the recording"
+)
 CANDIDATES = 3  # keyframes that a lost frame is compared with
 # The world of a recording without poses: origin at the first camera, z up if that camera is level.
 T_WORLD_FIRST = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+logger = logging.getLogger(__name__)
 
 
 class RgbdTracker(Tracker):
@@ -55,11 +66,43 @@ class RgbdTracker(Tracker):
         self.preprocess = preprocess or PreprocessSettings()
         self.odometry = KeyframeOdometry(self.settings, self.preprocess)
         self.T_world_first = np.array(T_world_first, np.float64)
+        self.fixed = FixedPart()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Where the camera is and how it moves: of a tracker that has seen nothing."""
         self.motion = np.eye(4)  # T_before_last: of the last frame in the frame before it
         self.T_world_camera = self.T_world_first  # of the last frame that was tracked
         self.lost = False
+        self.known_motion = False  # whether `motion` was observed
+        self.before: PreparedFrame | None = None  # the last frame, where it was tracked
+        self.missed = 0  # frames since then
 
     def track(self, frame: Frame) -> TrackedFrame:
+        if self.fixed.looking and self.fixed.look(frame):
+            return self._begin_again()
+        if self.fixed.mask is not None:
+            frame = replace(frame, depth=without(frame, self.fixed.mask))
+        tracked = self._track(frame)
+        self.missed = self.missed + 1 if self.lost else 0
+        return tracked
+
+    def _begin_again(self) -> TrackedFrame:
+        """Track the first frames once more, without what is fixed to the camera."""
+        skipped = [p for p in self.odometry.placements if p.tracked.verdict in NOT_LOADED]
+        self.odometry = KeyframeOdometry(self.settings, self.preprocess, self.odometry.version + 1)
+        self._forget()
+        assert self.fixed.mask is not None
+        logger.warning(FIXED, 100 * self.fixed.mask.mean())
+        tracked = []
+        for frame in self.fixed.seen:
+            while skipped and skipped[0].tracked.index < frame.index:
+                self.odometry.placements.append(skipped.pop(0))
+            tracked.append(self.track(frame))
+        self.fixed.seen.clear()
+        return tracked[-1]
+
+    def _track(self, frame: Frame) -> TrackedFrame:
         odometry = self.odometry
         prepared = odometry.prepare(frame)
         if prepared.blank:
@@ -67,6 +110,8 @@ class RgbdTracker(Tracker):
         if not len(odometry.keyframes):
             return self._start(prepared)
         found, problem = self._align(prepared)
+        if found is None and self._promote_last():
+            found, _ = self._align(prepared)
         if found is not None:
             return self._accept(prepared, found, Verdict.TRACKED)
         if (place := self._relocalise(prepared)) is not None:
@@ -110,7 +155,7 @@ class RgbdTracker(Tracker):
                     message="no other frame fits it",
                 )
             self.odometry.placements.append(Placement(lost))
-        self.lost, self.motion = False, np.eye(4)
+        self._forget()
         return self._start(prepared)
 
     def _align(self, prepared: PreparedFrame) -> tuple[Registration | None, str]:
@@ -132,11 +177,26 @@ class RgbdTracker(Tracker):
                 T_world_camera,
                 self.settings.window,
                 SURE_AGREEMENT if self.lost else FRAME_AGREEMENT,
+                self.T_world_camera @ self.motion if self.known_motion else None,
             )
             if not wrong:
                 return found, ""
             problem = problem or wrong
         return None, problem
+
+    def _promote_last(self) -> bool:
+        """Make the frame before a keyframe, which is nearer than the one that it was aligned to."""
+        last, placements = self.before, self.odometry.placements
+        if last is None or not placements or placements[-1].tracked.index != last.frame.index:
+            return False
+        at, reference = placements[-1], self.odometry.reference
+        itself = self.odometry.keyframes.items[reference].index == last.frame.index
+        if itself or at.keyframe != reference or at.registration is None:
+            return False
+        number = self.odometry.add_keyframe(last, self.T_world_camera, at.registration)
+        self.odometry.link_keyframe(number, by_appearance=False)
+        self.T_world_camera = self.odometry.keyframes.T_world_keyframe[number]
+        return True
 
     def _by_features(self, prepared: PreparedFrame) -> NDArray | None:
         reference = self.odometry.reference
@@ -156,9 +216,18 @@ class RgbdTracker(Tracker):
             found = register(
                 prepared.pyramid, keyframes.pyramid(number), guess, self.settings.photometric_weight
             )
-            if believable(found, guess):
+            T_world_camera = keyframes.T_world_keyframe[number] @ found.T_target_source
+            distance, _ = se3.distance(self.T_world_camera, T_world_camera)
+            if believable(found, guess) and distance < self._reach:
                 return number, found
         return None
+
+    @property
+    def _reach(self) -> float:
+        """How far the camera may have come [m] since it was last seen: a place that repeats looks
+        like this one, too.
+        """
+        return REACH + FASTEST * (self.missed + 1)
 
     def _accept(
         self, prepared: PreparedFrame, found: Registration, verdict: Verdict
@@ -167,6 +236,7 @@ class RgbdTracker(Tracker):
         T_world_camera = se3.normalized(
             odometry.keyframes.T_world_keyframe[odometry.reference] @ found.T_target_source
         )
+        self.known_motion, self.before = not self.lost, prepared
         self.motion = np.eye(4) if self.lost else se3.inverse(self.T_world_camera) @ T_world_camera
         self.lost = False
         tracked = odometry.place(prepared, verdict, found.T_target_source, found)
@@ -178,5 +248,5 @@ class RgbdTracker(Tracker):
         return replace(tracked, T_world_camera=T_world_camera)
 
     def _give_up(self, frame: Frame, problem: str) -> TrackedFrame:
-        self.lost, self.motion = True, np.eye(4)
+        self.lost, self.motion, self.known_motion = True, np.eye(4), False
         return self.odometry.give_up(frame.index, frame.timestamp, Verdict.LOST, problem)

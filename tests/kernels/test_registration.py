@@ -141,6 +141,35 @@ def test_sum_normal_equations(step, weight):
     )
 
 
+def test_leave_out():
+    """What is left out has a depth below 0, and comes back."""
+    packed = surfels(7)
+    moving = (np.random.default_rng(7).uniform(size=(5, 4)) < 0.4).astype(np.uint8)
+    changed = packed.copy()
+    kernels.leave_out(moving, changed)
+    np.testing.assert_array_equal(changed, reference.leave_out(moving, packed))
+    assert (changed[..., 0] < 0).any()
+    kernels.leave_out(np.zeros_like(moving), changed)
+    np.testing.assert_array_equal(changed, packed)
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_compare_surfels(step):
+    source, target = surfels(8), surfels(9, 14, 18)
+    source[::3, ::2, 0] *= -1  # what is left out of the source is compared, of the target it is not
+    target[::5, ::4, 0] *= -1
+    K = np.array([(20, 21, 7.5, 5.5), (20, 20, 8.5, 6.5)], np.float32)
+    T = se3.exp(np.array([0.01, -0.02, 0.005, 0.02, 0.01, -0.03]))
+    size = [-(-n // step) for n in source.shape[:2]]
+    compared = np.empty((*size, kernels.COMPARED), np.float32)
+    kernels.compare_surfels(source, target, *K, T[:3], step, compared)
+    expected = reference.compare_surfels(
+        source.astype(float), target.astype(float), *K.astype(float), T, step
+    )
+    np.testing.assert_allclose(compared, expected, rtol=1e-3, atol=1e-4)
+    assert 5 < (compared[..., 0] < kernels.UNSEEN).sum() < compared[..., 0].size
+
+
 def test_the_gradient_is_that_of_the_cost():
     """b is half the derivative of the weighted squares while weights and associations stand still:
     of the geometric part.

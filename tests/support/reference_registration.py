@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 DEPTH, NORMAL, INTENSITY, SLOPE_U, SLOPE_V, CHANNELS = 0, slice(1, 4), 4, 5, 6, 8
-FREEDOM, LEAST_SLOPE, NEAR = 5.0, 0.012, 0.05
+FREEDOM, LEAST_SLOPE, NEAR, UNSEEN = 5.0, 0.012, 0.05, 1e9
 
 
 def average_inverse_depth(inverse, factor, jump):
@@ -113,3 +113,40 @@ def sum_normal_equations(
             H += scale * np.outer(row, row)
             b += scale * row * residual
     return H, b, counts
+
+
+def leave_out(moving, surfels):
+    """Depths below 0 where the mask, of any size, says so."""
+    kept = surfels.copy()
+    for v, u in product(range(surfels.shape[0]), range(surfels.shape[1])):
+        i, j = v * moving.shape[0] // surfels.shape[0], u * moving.shape[1] // surfels.shape[1]
+        kept[v, u, DEPTH] = abs(surfels[v, u, DEPTH]) * (-1 if moving[i, j] else 1)
+    return kept
+
+
+def compare_surfels(source, target, K_source, K_target, T, step):
+    """(h / step, w / step, 3): how far in front [standard deviations], how much darker, slope."""
+    height, width = (-(-n // step) for n in source.shape[:2])
+    compared = np.zeros((height, width, 3))
+    compared[..., 0] = UNSEEN
+    for row, column in product(range(height), range(width)):
+        v, u = row * step, column * step
+        z = abs(source[v, u, DEPTH])
+        p = T[:3, :3] @ unprojected(u, v, z, K_source) + T[:3, 3]
+        if z == 0 or p[2] <= NEAR:
+            continue
+        x, y = K_target[0] * p[0] / p[2] + K_target[2], K_target[1] * p[1] / p[2] + K_target[3]
+        if not (0 <= x <= target.shape[1] - 1 and 0 <= y <= target.shape[0] - 1):
+            continue
+        j, i = int(x + 0.5), int(y + 0.5)
+        depth, n = target[i, j, DEPTH], target[i, j, NORMAL]
+        if depth <= 0:
+            continue
+        slope = target[i, j, [SLOPE_U, SLOPE_V]]
+        r = n @ (p - unprojected(j, i, depth, K_target))
+        compared[row, column] = (
+            r / np.sqrt(axial_variance(depth) + axial_variance(z)),
+            target[i, j, INTENSITY] + slope @ (x - j, y - i) - source[v, u, INTENSITY],
+            np.abs(slope).sum(),
+        )
+    return compared
