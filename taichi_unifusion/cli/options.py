@@ -132,7 +132,11 @@ class TrackingOptions:
     """Camera poses. given: the recording's; external: from --trajectory; internal: either of them,
     refined; rgbd: from the frames alone."""
     trajectory: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
-    """Poses of another program: TUM, KITTI or Replica file, or a folder of one matrix a frame."""
+    """Poses of another program: a file of TUM, KITTI, Replica, COLMAP (images.txt, images.bin), EuRoC
+    (data.csv), Redwood or Open3D (.log, .json), a transforms.json, or a folder of one matrix a frame.
+    """
+    body_camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
+    """Where the camera sits on the body of EuRoC's poses: its sensor.yaml (T_BS), or 4 rows of 4 numbers."""
     interpolate: FlagCreatePairsOff[bool] = False
     """Fill gaps of up to a second between the poses of --trajectory."""
 

@@ -265,6 +265,7 @@ def _track(
             mode=poses.tracking,
             trajectory=poses.trajectory,
             interpolate=poses.interpolate,
+            body_camera=poses.body_camera,
             max_difference=options.recording.max_difference,
             stop=stop,
             on_frame=on_frame,

@@ -28,6 +28,7 @@ class CameraFile:
     depth_scale: float | None = None
     depth_invalid: tuple[int, ...] = INVALID_DEPTH  # units that mean no reading
     poses: str | None = None  # file or folder beside camera.yaml
+    body_camera: str | None = None  # file: where the camera sits on the body of EuRoC's poses
 
     def camera(self, source: str) -> PinholeCamera:
         """The pinhole camera; an impossible one is a DatasetError naming its source."""

@@ -10,7 +10,8 @@ camera took it. Frames are the names, in the order of the numbers in them. Infra
 Poses: camera-to-world in metres, camera x right, y down, z forward, as `poses/NAME.txt` (4x4 each),
 or `poses.txt` with rows `NAME tx ty tz qx qy qz qw` (where images are named by time it may be a
 time stamp, matched within max_difference; `pose_rows.py` has the rules), or `poses.txt` with one row
-of 16 numbers for every frame, in their order.
+of 16 or 12 numbers for every frame, in their order; or, named as `poses` in camera.yaml, a file of
+COLMAP, EuRoC, Redwood, Open3D or a transforms.json.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from pathlib import Path
 
 from ..errors import DatasetError
 from ..files.frame_files import files_by_stem, in_order, list_names
-from ..files.trajectories import REPLICA, TUM, Pose, read_pose_file, read_pose_rows
+from ..files.pose_files import colmap_file, read_pose_list
+from ..files.trajectories import Pose, read_pose_file
 from ..geometry.time_stamps import check_max_difference, unit_of
 from ..types import PinholeCamera
 from .camera_yaml import CameraFile, read_camera_yaml
@@ -57,7 +59,7 @@ def open_folder(
         raise DatasetError(f"{path / 'depth'}: no *.png (16 bits) or *.npy here")
     stems = in_order({*depth, *color})
     warnings: list[str] = []
-    poses = _read_poses(_pose_source(path, settings), stems, max_difference, warnings)
+    poses = _read_poses(path, settings, stems, max_difference, warnings)
     times = times_of(stems)
     if times:
         say_unit(path / "depth", unit_of(stems), warnings)
@@ -123,21 +125,32 @@ def _pose_source(path: Path, settings: CameraFile) -> Path | None:
 
 
 def _read_poses(
-    source: Path | None, stems: Sequence[str], max_difference: float, warnings: list[str]
+    path: Path,
+    settings: CameraFile,
+    stems: Sequence[str],
+    max_difference: float,
+    warnings: list[str],
 ) -> list[Pose | None]:
     """The pose of every frame, in the order of `stems`; all None where no poses are given."""
+    source = _pose_source(path, settings)
     if source is None:
         return [None] * len(stems)
     if os.path.isdir(source):  # unlike Path.is_dir it answers for any name
-        return [read_pose_file(source / f"{stem}.txt") for stem in stems]
-    rows = read_pose_rows(source, (TUM, REPLICA))
-    if rows[0].name:
+        model = colmap_file(source)
+        if model is None:
+            return [read_pose_file(source / f"{stem}.txt") for stem in stems]
+        source = model
+    body_camera = None if settings.body_camera is None else path / settings.body_camera
+    listed = read_pose_list(source, body_camera)
+    rows = listed.rows
+    warnings += listed.warnings
+    if listed.key != "place":
         named = rows_of_frames(rows, source, stems, max_difference)
         warnings += named.warnings
         return [*named.poses]
     if len(rows) != len(stems):
         raise DatasetError(
-            f"{source}: {len(rows)} rows for {len(stems)} frames; rows of 16 numbers bear no names, so every "
+            f"{source}: {len(rows)} rows for {len(stems)} frames; its rows bear no names, so every "
             "frame needs one; else write rows of 'name tx ty tz qx qy qz qw'"
         )
     return [row.pose for row in rows]

@@ -19,14 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import DatasetError, FrameError, shortened
 from ..files.frame_files import in_order
 from ..files.images import color_file_size, read_color, read_scaled_depth
-from ..files.strict_json import list_of, number, numbers, read_object
-from ..files.trajectories import Pose
-from ..geometry.se3 import FLIP_YZ
+from ..files.strict_json import list_of, number, read_object
+from ..files.transforms import Applied
 from .depth_camera import make_camera
 from .depth_registration import LensCamera
 from .file_recording import check_depth_scale
@@ -59,7 +57,7 @@ def open_nerfstudio(
     warnings = []
     if len(with_depth) < len(frames):
         warnings.append(f"{len(frames) - len(with_depth)} frames without depth left out")
-    undo = _Undo(values, str(file))
+    applied = Applied(values, str(file))
     names = in_order({str(each.get("file_path")) for each in with_depth})
     order = {name: i for i, name in enumerate(names)}
     with_depth.sort(key=lambda each: order[str(each.get("file_path"))])
@@ -67,7 +65,7 @@ def open_nerfstudio(
         _shot(
             file,
             {**values, **each},
-            undo,
+            applied,
             _scale(depth_scale, {**values, **each}, file),
             drop_alpha,
         )
@@ -101,31 +99,8 @@ def _scale(given: float | None, frame: Mapping[str, Any], file: Path) -> float:
     return 1.0 / metres
 
 
-class _Undo:
-    """The motion and the scale that somebody has applied to all poses."""
-
-    def __init__(self, values: Mapping[str, Any], where: str) -> None:
-        self.scale = number(values, "applied_scale", where, 1.0)
-        self.T_world_applied = np.eye(4)
-        if "applied_transform" in values:
-            rows = values["applied_transform"]
-            count = len(rows) if isinstance(rows, list) else 3
-            T = np.eye(4)
-            T[:3] = numbers(rows, (4 if count == 4 else 3, 4), f"{where}: applied_transform")[:3]
-            if abs(np.linalg.det(T)) < 1e-6 or not np.isfinite(T).all():
-                raise DatasetError(f"{where}: applied_transform cannot be undone")
-            self.T_world_applied = np.linalg.inv(T)
-        if not self.scale > 0:
-            raise DatasetError(f"{where}: applied_scale must be above 0, found {self.scale:g}")
-
-    def __call__(self, T: NDArray[np.float64]) -> NDArray[np.float64]:
-        T = T.copy()
-        T[:3, 3] /= self.scale
-        return self.T_world_applied @ T
-
-
 def _shot(
-    file: Path, frame: Mapping[str, Any], undo: _Undo, depth_scale: float, drop_alpha: bool
+    file: Path, frame: Mapping[str, Any], applied: Applied, depth_scale: float, drop_alpha: bool
 ) -> Shot:
     name, key = frame.get("file_path"), _depth_key(frame)
     if not isinstance(name, str) or key is None:
@@ -138,7 +113,7 @@ def _shot(
         partial(read_scaled_depth, depth, depth_scale),
         partial(read_color, color, drop_alpha=drop_alpha),
         None,
-        _pose(frame, undo, f"{file}: {name}"),
+        applied.pose_of(frame, f"{file}: {name}"),
         float(stamp) if isinstance(stamp, int | float) and abs(stamp) < 1e300 else None,
     )
 
@@ -152,17 +127,6 @@ def _existing(path: Path) -> Path:
     except (OSError, ValueError):  # a name that no file can have
         pass
     return path
-
-
-def _pose(frame: Mapping[str, Any], undo: _Undo, where: str) -> Pose:
-    try:
-        rows = frame.get("transform_matrix")
-        count = len(rows) if isinstance(rows, list) else 4
-        T = np.eye(4)
-        T[:count] = numbers(rows, (3 if count == 3 else 4, 4), f"{where}: transform_matrix")
-    except DatasetError as error:
-        return Pose(where, problem=str(error).removeprefix(f"{where}: "))
-    return Pose(where, undo(T) @ FLIP_YZ)
 
 
 def _lens(frame: Mapping[str, Any], color: Path, where: str) -> LensCamera:

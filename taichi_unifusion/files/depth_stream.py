@@ -88,12 +88,12 @@ class DepthStream:
         with open(self.path, "rb") as file:
             file.seek(offset)
             while len(image) < count:
-                if not rest:
-                    rest = file.read(CHUNK)
-                    offset += len(rest)
-                if not rest or unpacker.eof:
+                fresh = b"" if rest else file.read(CHUNK)
+                offset += len(fresh)
+                part = unpacker.decompress(rest or fresh, count - len(image))
+                if not (part or rest or fresh):
                     raise ValueError(f"there are {place.number} images")
-                image += unpacker.decompress(rest, count - len(image))
+                image += part
                 rest = unpacker.unconsumed_tail
         return bytes(image), _Place(place.number + 1, offset, unpacker.copy(), rest)
 

@@ -66,6 +66,7 @@ def track(
     trajectory: str | Path | None = None,
     interpolate: bool = False,
     max_difference: float | None = None,
+    body_camera: Path | None = None,
     stop: Callable[[], bool] = lambda: False,
     on_frame: Callable[[int, int], None] = lambda done, total: None,
 ) -> PosedFrames:
@@ -73,8 +74,9 @@ def track(
 
     Track all frames of a recording and thin them afterwards: small steps are easier. `trajectory`
     is the file or folder for external, and for internal instead of given poses; `interpolate` fills
-    short gaps in it, `max_difference` [s] is how far a pose may be from its frame. `stop` is asked
-    before every frame, `on_frame` told how many of them are done.
+    short gaps in it, `max_difference` [s] is how far a pose may be from its frame, `body_camera` the
+    file that says where the camera sits on the body of EuRoC's poses. `stop` is asked before every
+    frame, `on_frame` told how many of them are done.
 
     Raises InputError for an unknown mode or a trajectory that is missing or not used, DatasetError
     where there are no poses and the mode needs them.
@@ -89,6 +91,7 @@ def track(
         trajectory=trajectory,
         interpolate=interpolate,
         max_difference=max_difference,
+        body_camera=body_camera,
     )
     logger.info("tracking: %s", mode)
     return PosedFrames(frames, track_sequence(frames, tracker, stop=stop, on_frame=on_frame))
@@ -102,6 +105,7 @@ def make_tracker(
     trajectory: str | Path | None = None,
     interpolate: bool = False,
     max_difference: float | None = None,
+    body_camera: Path | None = None,
 ) -> Tracker:
     """The tracker of that mode; arguments and errors as for `track`."""
     kind = _kind(mode)
@@ -112,7 +116,7 @@ def make_tracker(
             f"tracking: {what} a trajectory file, which '{mode}' does not read; use "
             f"{' or '.join(readers)} with it"
         )
-    source = PoseSource(trajectory, interpolate, max_difference)
+    source = PoseSource(trajectory, interpolate, max_difference, body_camera)
     return kind.make(settings or TrackingSettings(), preprocess or PreprocessSettings(), source)
 
 

@@ -180,6 +180,7 @@ class PoseSource:
     trajectory: str | Path | None = None  # file or folder
     interpolate: bool = False  # between its poses, over short gaps
     max_difference: float | None = None  # [s] between a frame and its pose; None: the usual
+    body_camera: Path | None = None  # file: where the camera sits on the body of EuRoC's poses
 
 
 class Tracker(ABC):

@@ -45,7 +45,7 @@ class ExternalPoseTracker(Tracker):
             raise InputError("tracking: external needs a trajectory file (--trajectory FILE)")
         difference = source.max_difference
         return cls(
-            read_poses(source.trajectory),
+            read_poses(source.trajectory, source.body_camera),
             source.interpolate,
             MAX_DIFFERENCE if difference is None else difference,
         )

@@ -1,9 +1,9 @@
-"""Trajectories that other programs wrote: TUM, KITTI, Replica, or a folder of one matrix a frame
-(ScanNet, 7-Scenes).
+"""Trajectories that other programs wrote: TUM, KITTI, Replica, COLMAP, EuRoC, Redwood and Open3D,
+`transforms.json`, or a folder of one matrix a frame (ScanNet, 7-Scenes).
 
-All camera to world in metres. TUM rows carry time stamps; the rows of KITTI (12 numbers) and
-Replica (16) belong to frames 0, 1, 2 ... of the recording, the files of a folder to the number in
-their names.
+All camera to world in metres. Rows of TUM and EuRoC carry time stamps; those of KITTI (12 numbers),
+Replica (16) and Redwood belong to frames 0, 1, 2 ... of the recording, the files of a folder and the
+images of COLMAP and of a `transforms.json` to the frame with the number in their names.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from ..datasets.pose_rows import say_unit
 from ..errors import DatasetError, PoseError
 from ..files.frame_files import list_names, number_of
-from ..files.trajectories import Pose, read_pose_file, read_pose_rows, stamped
+from ..files.pose_files import colmap_file, read_pose_list
+from ..files.trajectories import Pose, PoseRow, read_pose_file, stamped
 
 
 @dataclass(frozen=True)
@@ -36,26 +37,48 @@ class ExternalPoses:
     by_name: bool = False
 
 
-def read_poses(path: str | Path) -> ExternalPoses:
-    """Read a trajectory; the number of columns tells its format.
+def read_poses(path: str | Path, body_camera: Path | None = None) -> ExternalPoses:
+    """Read a trajectory in any of the formats of `files.pose_files`; `body_camera` is the file that
+    says where the camera sits on the body of EuRoC's poses.
 
     Raises DatasetError, with the line, where it holds no poses; a single pose that is not rigid is
     left out, which a warning says.
     """
     path = Path(path).expanduser()
-    if path.is_dir():
+    model = colmap_file(path) if path.is_dir() else None
+    if path.is_dir() and model is None:
         poses = _checked(
             path, False, [(number, read_pose_file(file)) for number, file in _numbered(path)]
         )
         return replace(poses, by_name=True)
-    rows = read_pose_rows(path)
-    if rows[0].name:
+    path = model or path
+    listed = read_pose_list(path, body_camera)
+    rows, warnings = listed.rows, [*listed.warnings]
+    if listed.key == "place":
+        poses = _checked(path, False, [(number, row.pose) for number, row in enumerate(rows)])
+    elif listed.key == "name":
+        poses = replace(_checked(path, False, _by_number(rows, path)), by_name=True)
+    else:
         timed = stamped(rows)
         poses = _checked(path, True, [(row.timestamp, row.pose) for row in timed])
-        warnings: list[str] = []
         say_unit(path, timed[0].unit, warnings)
-        return replace(poses, warnings=(*warnings, *poses.warnings))
-    return _checked(path, False, [(number, row.pose) for number, row in enumerate(rows)])
+    return replace(poses, warnings=(*warnings, *poses.warnings))
+
+
+def _by_number(rows: Sequence[PoseRow], path: Path) -> list[tuple[int, Pose]]:
+    """Poses that images are named for, by the numbers in those names."""
+    numbered = [(number_of(row.name), row) for row in rows]
+    found: dict[int, PoseRow] = {}
+    for number, row in numbered:
+        if number is None:
+            raise DatasetError(
+                f"{row.pose.source}: there is no number in the name '{row.name[:60]}'"
+            )
+        if found.setdefault(number, row) is not row:
+            raise DatasetError(
+                f"{path}: the images '{found[number].name[:60]}' and '{row.name[:60]}' have one number; rename them"
+            )
+    return [(number, row.pose) for number, row in found.items()]
 
 
 def _numbered(folder: Path) -> list[tuple[int, Path]]:
