@@ -7,6 +7,7 @@ TUM, KITTI, Replica (trajectories.py), COLMAP's `images.txt` and `images.bin`, E
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +16,7 @@ from .colmap import is_colmap_text, read_colmap
 from .euroc import is_euroc, read_body_camera, read_euroc
 from .open3d_trajectories import is_log, read_json_trajectory, read_log
 from .strict_json import read_object
+from .text_rows import read_lines, split_row
 from .trajectories import PoseRow, read_pose_rows
 from .transforms import pose_rows
 
@@ -59,10 +61,16 @@ def read_pose_list(path: Path, body_camera: Path | None = None) -> PoseFile:
             read_colmap(path),
             (f"{path}: COLMAP's unit is taken as a metre, which holds for a scaled model only",),
         )
-    if is_log(path):
+    if path.suffix.lower() == ".log" or (is_log(path) and _has_blocks(path)):
         return _log(path)
     rows = read_pose_rows(path)
     return PoseFile("time" if rows[0].name else "place", rows)
+
+
+def _has_blocks(path: Path) -> bool:
+    """Whether a row of three numbers is followed by one of four."""
+    rows = [split_row(line) for _, line in islice(read_lines(path), 2)]
+    return [len(row) for row in rows] == [3, 4]
 
 
 def _euroc(path: Path, body_camera: Path | None) -> PoseFile:

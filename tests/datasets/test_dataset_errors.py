@@ -259,7 +259,7 @@ def test_folder_ambiguities_are_refused(tmp_path):
         open_dataset("folder", folder)
     (folder / "camera.yaml").write_text(CAMERA_YAML + "poses: poses.txt\n")
     with pytest.raises(
-        DatasetError, match="poses.txt, line 1: expected 8 columns .* or 16 .* found 3"
+        DatasetError, match="poses.txt, line 1: expected 8 columns .* or 12 .* or 16 .* found 3"
     ):
         open_dataset("folder", folder)
     (folder / "poses.txt").write_text("img1 0 0 0 0 0 0 1\nimg1 0 0 0 0 0 0 1\n")
