@@ -40,7 +40,9 @@ def test_poses_come_back(tmp_path, name):
     body_camera = tmp_path / "sensor.yaml" if name == "data.csv" else None
     write.sensor_yaml(tmp_path / "sensor.yaml")
     poses = read_poses(tmp_path / name, body_camera)
-    assert poses.keys == pytest.approx(keys, abs=1e-6, rel=0) and poses.by_time == (name == "data.csv")
+    assert poses.keys == pytest.approx(keys, abs=1e-6, rel=0) and poses.by_time == (
+        name == "data.csv"
+    )
     np.testing.assert_allclose(poses.T_world_camera, POSES, atol=EXACT)
 
 
