@@ -81,13 +81,15 @@ def building_frames(options: argparse.Namespace) -> Iterator[tuple[int, Frame]]:
     """The flat of every frame, and the frame at its place in the building."""
     from house import load_house
 
-    flat = [load_house(options.path, "tour")[i] for i in range(0, 603, options.every)]
+    tour = load_house(options.path, "tour")
+    flat = [tour[i] for i in range(0, len(tour), options.every)]
+    center = (options.columns - 1) / 2, (options.rows - 1) / 2  # the index reaches 205 m each way
     for n in range(options.rows * options.columns):
         row, column = divmod(n, options.columns)
         column = column if row % 2 == 0 else options.columns - 1 - column  # to and fro
         for i, frame in enumerate(flat):
             T = frame.require_pose().copy()
-            T[:2, 3] += PITCH * (column, row)
+            T[:2, 3] += PITCH * (column - center[0], row - center[1])
             yield n, replace(frame, T_world_camera=T, index=n * len(flat) + i)
 
 
@@ -97,8 +99,8 @@ def run_building(options: argparse.Namespace) -> None:
     from taichi_unifusion.results.tiled import stream_mesh
 
     out = options.out or Path(tempfile.mkdtemp(prefix="building"))
-    config = Config(detail="room") if "room" in Config.__annotations__ else Config()
-    pipeline = Pipeline(replace(config, map_memory=options.map_memory), tiles=out / "maps")
+    config = replace(Config(voxel_size=0.05), map_memory=options.map_memory)
+    pipeline = Pipeline(config, tiles=out / "maps")
     assert pipeline.memory is not None
     spent: dict[int, list[float]] = {}
     print("flats  ms a frame (CPU)  voxels in memory  on disk MB  peak memory MB", flush=True)
