@@ -43,6 +43,8 @@ class Options:
     """How many processes are killed."""
     frames: int = 40
     """Frames of the synthetic room that a run has."""
+    minutes: float = 60.0
+    """It ends after so long, with fewer kills."""
     seed: int = 0
     """Of the moments."""
 
@@ -94,7 +96,8 @@ def main(options: Options) -> int:
         took = time.monotonic() - began
         expected = contents(RunFolder(place / "whole"))
         folder = RunFolder(place / "killed")
-        while kills < options.kills:
+        began = time.monotonic()
+        while kills < options.kills and time.monotonic() - began < 60 * options.minutes:
             arguments = command(folder.path, options, "--save-every", "0.05", "--resume")
             code, said = run(arguments, chance.uniform(0.1, 1.0) * took)
             if code == -signal.SIGKILL:
