@@ -99,7 +99,7 @@ def main(options: Options) -> int:
         began = time.monotonic()
         while kills < options.kills and time.monotonic() - began < 60 * options.minutes:
             arguments = command(folder.path, options, "--save-every", "0.05", "--resume")
-            code, said = run(arguments, chance.uniform(0.1, 1.0) * took)
+            code, said = run(arguments, chance.uniform(0.1, 1.4) * took)
             if code == -signal.SIGKILL:
                 kills += 1
                 moments[moment_of(folder, said)] += 1
