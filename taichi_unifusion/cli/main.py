@@ -39,6 +39,7 @@ from .mesh import ExtractMesh, extract_mesh
 from .query import Query, query
 from .reconstruct import Reconstruct, reconstruct
 from .render import Render, render
+from .repose import Repose, repose
 from .segment import Segment, segment
 from .terminal import DONE, FAILED, PlainOutput, log_to_stderr, report
 from .transfer import Transfer, transfer
@@ -66,6 +67,7 @@ COMMANDS: Commands = {
     "mesh": (ExtractMesh, extract_mesh),
     "merge": (Merge, merge),
     "batch": (Batch, batch),
+    "repose": (Repose, repose),
     "export": (Export, export),
     "convert": (Convert, convert),
     "info": (Info, info),

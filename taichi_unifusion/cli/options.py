@@ -139,6 +139,10 @@ class TrackingOptions:
     """Where the camera sits on the body of EuRoC's poses: its sensor.yaml (T_BS), or 4 rows of 4 numbers."""
     interpolate: FlagCreatePairsOff[bool] = False
     """Fill gaps of up to a second between the poses of --trajectory."""
+    tracking_passes: Literal[1, 2] = 2
+    """2: all frames are tracked before any is mapped; 1: frames are tracked and mapped as they come, and the map
+    follows when a loop moves them.
+    """
 
     @property
     def tracked(self) -> bool:
@@ -164,6 +168,10 @@ class OutputOptions:
     """YAML file of settings that differ from the defaults; options given here count more."""
     json: FlagCreatePairsOff[bool] = False
     """Print the metrics as JSON instead of tables."""
+    keep_windows: FlagCreatePairsOff[bool] = False
+    """Keep what the maps were fused from (windows.log), so that `unifusion repose` can move them to other poses."""
+    forget: FlagCreatePairsOff[bool] = False
+    """Keep no windows.log of a run in one pass: some megabytes for every second of the recording."""
     up: UpOption = None
     """Which way is up in the world: an axis as z or -y, or three numbers."""
 

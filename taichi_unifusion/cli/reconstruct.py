@@ -6,7 +6,7 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -18,7 +18,8 @@ from ..datasets import Dataset
 from ..errors import InputError
 from ..geometry.gravity import Up, parse_up
 from ..tracking import check_poses, track
-from .color_camera import given_color
+from .color_camera import found_color, given_color
+from .following import Mapped, in_one_pass, keep_store, map_in_one_pass, open_store
 from .interrupts import INTERRUPTED, stop_on_signal
 from .live import LiveOptions, reconstruct_live
 from .on_workers import check_workers, remove_shards, run_on_workers
@@ -38,7 +39,7 @@ from .viewing import WatchOptions, open_watcher
 if TYPE_CHECKING:
     from ..networks.encoders import ImageEncoder
     from ..results import RunFolder
-    from ..results.record import ColorRecord
+    from ..results.record import ColorRecord, Source
     from ..results.saver import RunSaver
     from ..run_log import RunResult
     from ..tracking.sequence import PosedFrames
@@ -93,6 +94,11 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     check_poses(recording, options.poses.tracking, options.poses.trajectory)
     if options.cluster.wanted and options.output.resume:
         raise InputError("--resume: a run on several workers cannot go on; leave one of them out")
+    if options.output.resume and (options.output.keep_windows or options.poses.tracking_passes == 1):
+        raise InputError(
+            "--resume: a run that keeps windows (--keep-windows, --tracking-passes 1) cannot go on yet; leave "
+            "--resume out"
+        )
     check_workers(
         options.cluster, encoder is not None, options.watch.view or options.watch.view_window
     )
@@ -158,32 +164,10 @@ def _fuse_and_write(
     from ..results.summary import summarize
     from ..results.writer import write_results
 
-    tracking, tracked, written = None, None, ()
-    if options.poses.tracked:
-        recording, tracking = _track(recording, options, folder, stop, saver)
-        tracked, written = recording.tracking.frames, folder.tracking_files
-    recording, color = registered(recording, color, saver)
-    frames = recording[:: options.recording.every]
-    source = source_of(options.recording, len(frames), color)
-    saver.describe(source, tracking)
-    if options.cluster.wanted:
-        poses = tracked and tracked[:: options.recording.every]
-        pipeline, run = run_on_workers(
-            frames, source, poses, options.settings, options.cluster, folder, stop
-        )
-    else:
-        pipeline = make_pipeline(options, encoder, folder, saver)
-        with frame_progress(len(frames)) as on_frame:
-            run = pipeline.run(
-                frames,
-                strict=options.recording.strict,
-                stop=stop,
-                on_frame=on_frame,
-                on_step=watcher.on_step,
-                on_skip=watcher.on_skip,
-                on_border=saver.at_border,
-                before=saver.resumed and saver.resumed.so_far,
-            )
+    mapped, frames, source = _mapped(
+        recording, color, options, folder, stop, encoder, watcher, saver
+    )
+    pipeline, run, written = mapped.pipeline, mapped.run, mapped.written
     if not run.steps:
         logger.warning(
             "stopped before the first frame was done; %s",
@@ -200,7 +184,7 @@ def _fuse_and_write(
             done,
             len(frames),
         )
-    results = write_results(folder.path, pipeline, run, source, tracking, written, up)
+    results = write_results(folder.path, pipeline, run, source, mapped.tracking, written, up)
     if not results.failures:
         remove_shards(folder.shards)
     print(
@@ -213,6 +197,75 @@ def _fuse_and_write(
     end_saving(folder, done=not (run.interrupted or ended))
     code = _report_missing(run, len(frames)) or code
     return INTERRUPTED if stop() else code
+
+
+def _mapped(
+    recording: Dataset,
+    color: ColorRecord,
+    options: Reconstruct,
+    folder: RunFolder,
+    stop: Callable[[], bool],
+    encoder: ImageEncoder | None,
+    watcher: Watcher,
+    saver: RunSaver,
+) -> tuple[Mapped, Dataset, Source]:
+    """Track and map; also the frames that were to be mapped, and what the record keeps of them."""
+    every, wanted = options.recording.every, options.recording
+    if not options.cluster.wanted and in_one_pass(recording, options):
+        recording, color = found_color(recording, color)
+        mapped = map_in_one_pass(recording, options, folder, stop, encoder, watcher)
+        frames = recording[::every]
+        return mapped, frames, source_of(wanted, len(frames), color)
+    tracking, tracked, written = None, None, ()
+    if options.poses.tracked:
+        recording, tracking = _track(recording, options, folder, stop, saver)
+        tracked, written = recording.tracking.frames, folder.tracking_files
+    recording, color = registered(recording, color, saver)
+    frames = recording[::every]
+    source = source_of(wanted, len(frames), color)
+    saver.describe(source, tracking)
+    if options.cluster.wanted:
+        poses = tracked and tracked[::every]
+        mapped = Mapped(
+            *run_on_workers(frames, source, poses, options.settings, options.cluster, folder, stop),
+            None,
+            (),
+        )
+    else:
+        mapped = _map(frames, options, folder, stop, encoder, watcher, saver)
+    return replace(mapped, tracking=tracking, written=(*written, *mapped.written)), frames, source
+
+
+def _map(
+    frames: Dataset,
+    options: Reconstruct,
+    folder: RunFolder,
+    stop: Callable[[], bool],
+    encoder: ImageEncoder | None,
+    watcher: Watcher,
+    saver: RunSaver,
+) -> Mapped:
+    """Fuse frames at the poses that they have."""
+    from ..pipeline import Pipeline
+
+    keep, store = options.output.keep_windows, None
+    if keep:
+        store = open_store(folder, options.output, options.settings, moves=False)
+        pipeline = Pipeline(options.settings, encoder=encoder, keep=store)
+    else:
+        pipeline = make_pipeline(options, encoder, folder, saver)
+    with frame_progress(len(frames)) as on_frame:
+        run = pipeline.run(
+            frames,
+            strict=options.recording.strict,
+            stop=stop,
+            on_frame=on_frame,
+            on_step=watcher.on_step,
+            on_skip=watcher.on_skip,
+            on_border=None if keep else saver.at_border,
+            before=saver.resumed and saver.resumed.so_far,
+        )
+    return Mapped(pipeline, run, None, keep_store(folder, store))
 
 
 def _report_missing(run: RunResult, frames: int) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +126,13 @@ class WindowStore:
         if self._log is not None:
             self._log.close()
             self._log = None
+
+    def moved_to(self, path: Path) -> None:
+        """Note that the file, which is closed, has another name now."""
+        self.path = path
+        for kept in self.windows:
+            if kept.record is not None:
+                kept.record = replace(kept.record, path=path)
 
     def _spill(self, everything: bool = False) -> None:
         """Write windows that are packed, in order."""

@@ -43,6 +43,16 @@ class RunFolder:
         return self.path / "tracking.txt"
 
     @property
+    def windows(self) -> Path:
+        """What the windows of the maps were fused from, a `WindowStore`."""
+        return self.path / "windows.log"
+
+    @property
+    def new_windows(self) -> Path:
+        """The same of a run that is not done."""
+        return self.path / ".windows.log.tmp"
+
+    @property
     def color_camera(self) -> Path:
         """The colour camera that images were registered with, where there is one."""
         return self.path / "color_camera.yaml"
@@ -244,6 +254,7 @@ class RunFolder:
         if len(path.parts) == 2:
             return self.path / path == self.map(path.stem)
         fixed = (self.record, self.config, self.trajectory, self.color_camera, self.answers)
+        fixed = (*fixed, self.windows)
         fixed = {file.name for file in (*fixed, *self.tracking_files, *self.segmentation_files)}
         return name in fixed or path.suffix[1:] in (*MESH_SUFFIXES, "png")
 

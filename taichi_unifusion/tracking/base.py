@@ -172,6 +172,12 @@ class CurrentPoses:
         )
         return poses
 
+    @property
+    def by_frame(self) -> dict[int, NDArray[np.float64]]:
+        """The poses of frames that have one, by their place in the recording."""
+        posed = self.posed
+        return dict(zip(self.frames[posed].tolist(), self.T_world_camera[posed], strict=True))
+
 
 @dataclass(frozen=True)
 class PoseSource:

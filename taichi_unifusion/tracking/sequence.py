@@ -43,7 +43,7 @@ def track_sequence(
     """
     started, interrupted = time.perf_counter(), False
     frames = sequence if tracker.uses_given_poses else sequence.without_poses()
-    warnings = _said([*_pose_warnings(frames), *tracker.warnings])
+    warnings = say_warnings(frames, tracker)
     for i, load in enumerate(load_ahead(frames)):
         if interrupted := stop():
             break
@@ -54,8 +54,14 @@ def track_sequence(
         if tracked.verdict is Verdict.RELOCALISED:
             logger.info("frame %d: found again at keyframe %s", tracked.index, tracked.keyframe)
         on_frame(i + 1, len(sequence))
+    return concluded(tracker, time.perf_counter() - started, warnings, interrupted)
+
+
+def concluded(
+    tracker: Tracker, seconds: float, warnings: list[str], interrupted: bool
+) -> TrackingResult:
+    """What a tracker that has seen all frames gives, and what is to be said of it."""
     result = tracker.finish()
-    seconds = time.perf_counter() - started
     details = {
         **result.details,
         "verdicts": result.counts,
@@ -63,6 +69,11 @@ def track_sequence(
         "warnings": warnings + _said(_not_tracked(result)),
     }
     return replace(result, details=details, interrupted=interrupted)
+
+
+def say_warnings(frames: Dataset, tracker: Tracker) -> list[str]:
+    """Say what is odd about the poses of a recording and of a tracker, before it starts."""
+    return _said([*_pose_warnings(frames), *tracker.warnings])
 
 
 def _said(sentences: list[str]) -> list[str]:

@@ -1,0 +1,193 @@
+"""One pass: frames are tracked and fused as they come, and the map follows when a loop moves them."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..config import Config
+from ..datasets import Dataset
+from ..types import Trajectory
+from .color_camera import AUTO
+from .options import OutputOptions
+from .terminal import frame_progress
+
+if TYPE_CHECKING:
+    from ..maps.window_store import WindowStore
+    from ..networks.encoders import ImageEncoder
+    from ..pipeline import Pipeline
+    from ..results import RunFolder
+    from ..run_log import RunResult
+    from ..tracking import CurrentPoses
+    from ..viewer.null import Watcher
+    from .reconstruct import Reconstruct
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """Maps of a recording, and what made them."""
+
+    pipeline: Pipeline
+    run: RunResult
+    tracking: Mapping[str, Any] | None  # what to say of poses in the record
+    written: tuple[Path, ...]  # files that are in the folder already
+
+
+def in_one_pass(recording: Dataset, options: Reconstruct) -> bool:
+    """Whether frames are tracked and fused in one pass: asked for, and possible."""
+    poses = options.poses
+    if not poses.tracked or poses.tracking_passes == 2:
+        return False
+    obstacle = _obstacle(options.settings)
+    if options.recording.color_camera == AUTO and not recording.registered:
+        obstacle = (
+            "the colour camera is found from the poses of all frames; --color-camera knows it"
+        )
+    if obstacle:
+        logger.info("tracking all frames before any is mapped: %s", obstacle)
+    return not obstacle
+
+
+def _obstacle(settings: Config) -> str:
+    """Why maps of these settings cannot follow a trajectory that changes; "" if they can."""
+    if settings.map_memory:
+        return "a map in tiles, with map_memory, cannot follow a loop"
+    if "points" in (settings.surface.sampling, settings.color.sampling):
+        return "maps that take every point (sampling: points) cannot follow a loop"
+    return ""
+
+
+def open_store(folder: RunFolder, options: OutputOptions, settings: Config) -> WindowStore | None:
+    """A file for what windows are fused from, under a name for the time being; None where it is not
+    wanted.
+    """
+    from ..maps.window_store import WindowStore
+
+    if options.forget or _obstacle(settings):
+        return None
+    folder.new_windows.unlink(missing_ok=True)
+    return WindowStore(folder.new_windows)
+
+
+def keep_store(folder: RunFolder, store: WindowStore | None) -> tuple[Path, ...]:
+    """Give the file of windows its name; the files that are there then."""
+    if store is None or store.path is None:
+        return ()
+    store.sync()
+    store.close()
+    folder.new_windows.replace(folder.windows)
+    store.moved_to(folder.windows)
+    return (folder.windows,)
+
+
+def map_in_one_pass(
+    recording: Dataset,
+    options: Reconstruct,
+    folder: RunFolder,
+    stop: Callable[[], bool],
+    encoder: ImageEncoder | None,
+    watcher: Watcher,
+) -> Mapped:
+    """Track and fuse frames as they come, let the map follow, and end with all of it at the final
+    poses.
+    """
+    from .. import runtime
+    from ..files.trajectories import write_trajectory
+    from ..maps.window_store import WindowStore
+    from ..pipeline import Pipeline
+    from ..tracking.online import OnlineFrames
+    from ..tracking.sequence import concluded, say_warnings, write_tracking
+
+    poses, settings, started = options.poses, options.settings, time.perf_counter()
+    runtime.init(settings.device, threads=settings.threads or None)
+    tracker = _tracker(options)
+    store = open_store(folder, options.output, settings)
+    pipeline = Pipeline(settings, encoder=encoder, keep=WindowStore() if store is None else store)
+    frames = OnlineFrames(recording, tracker, options.recording.every, following(pipeline))
+    logger.info("tracking: %s, in one pass with mapping", poses.tracking)
+    warnings = say_warnings(frames.frames, tracker)
+    with frame_progress(len(frames)) as on_frame:
+        run = pipeline.run(
+            frames,
+            strict=options.recording.strict,
+            stop=stop,
+            on_frame=on_frame,
+            on_step=watcher.on_step,
+            on_skip=watcher.on_skip,
+        )
+    result = concluded(tracker, time.perf_counter() - started, warnings, run.interrupted)
+    run = settle(pipeline, run, tracker.current_poses())
+    run = replace(
+        run, skipped=tuple(replace(each, index=frames.place_of(each.index)) for each in run.skipped)
+    )
+    write_tracking(folder.tracking, result)
+    write_trajectory(folder.tracked_poses, result.trajectory)
+    assert pipeline.follower is not None
+    details = {
+        "mode": poses.tracking,
+        **result.details,
+        "passes": 1,
+        "following": {
+            name: round(value, 4) for name, value in asdict(pipeline.follower.summary()).items()
+        },
+    }
+    written = (*folder.tracking_files, *keep_store(folder, store))
+    return Mapped(pipeline, run, details, written)
+
+
+def _tracker(options: Reconstruct) -> Any:
+    from ..tracking import make_tracker
+
+    poses, settings = options.poses, options.settings
+    return make_tracker(
+        poses.tracking,
+        settings.tracking,
+        settings.preprocess,
+        trajectory=poses.trajectory,
+        interpolate=poses.interpolate,
+        max_difference=options.recording.max_difference,
+    )
+
+
+def following(pipeline: Pipeline) -> Callable[[CurrentPoses], None]:
+    """What ends the open window and lets the map follow when a tracker has moved earlier frames."""
+
+    def on_moved(poses: CurrentPoses) -> None:
+        assert pipeline.follower is not None
+        pipeline.fusion.close()
+        pipeline.follower.follow(poses.by_frame)
+
+    return on_moved
+
+
+def settle(pipeline: Pipeline, run: RunResult, poses: CurrentPoses) -> RunResult:
+    """Move all windows to the final poses; returns the run with these."""
+    assert pipeline.follower is not None
+    final = poses.by_frame
+    pipeline.follower.follow(final)
+    followed = pipeline.follower.finish()
+    if followed.moves:
+        logger.info(
+            "the map followed: %d of %d windows lie elsewhere than they were fused at first, up to %.1f cm; "
+            "%d moves, %.1f s",
+            followed.moved,
+            followed.windows,
+            100 * followed.farthest,
+            followed.moves,
+            followed.seconds,
+        )
+    before = run.trajectory
+    T = [final.get(step.index, T) for step, T in zip(run.steps, before.T_world_camera, strict=True)]
+    return replace(run, trajectory=Trajectory(before.timestamps, _stacked(T)))
+
+
+def _stacked(T: list) -> Any:
+    import numpy as np
+
+    return np.array(T, np.float64).reshape(-1, 4, 4)

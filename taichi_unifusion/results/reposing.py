@@ -1,0 +1,123 @@
+"""A finished map at other poses, without its images: its windows are fused again where a trajectory
+says that they belong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import FileError, InputError
+from ..geometry.se3 import distance, inverse, normalized
+from ..geometry.time_stamps import nearest
+from ..maps import BaseMap, load_map
+from ..maps.follower import MapFollower
+from ..maps.kept_window import placed
+from ..maps.property_group import MapGroup, group_maps
+from ..maps.window import WindowFusion
+from ..maps.window_store import WindowStore
+from ..tracking.trajectory_files import read_poses
+from ..types import Trajectory
+from .reader import read_run
+from .run_folder import RunFolder
+
+MAX_DIFFERENCE = 0.02  # [s] between a frame and its new pose
+
+
+@dataclass(frozen=True)
+class NewPoses:
+    """Where the frames of a run belong, by place in the recording."""
+
+    by_frame: Mapping[int, NDArray[np.float64]]  # every frame of the run
+    given: int  # frames that the trajectory has a pose for; others move as the nearest that has
+    trajectory: Trajectory  # of the frames used
+
+
+@dataclass(frozen=True)
+class Reposed:
+    """What moved."""
+
+    windows: int
+    moved: int  # by more than the least that counts
+    farthest: float  # [m]
+    median: float  # [m]
+
+
+class Refusing:
+    """Empty maps as those of a run, without what made their values: windows are fused into them."""
+
+    def __init__(self, folder: RunFolder) -> None:
+        loaded = [load_map(path) for path in folder.maps.values()]
+        self.maps: dict[str, BaseMap] = {
+            each.name: type(each)._empty(each.name, each.channels, each.settings) for each in loaded
+        }
+        self.groups: list[MapGroup] = group_maps(self.maps.values())
+        self.fusion = WindowFusion(1)
+
+
+def read_windows(folder: RunFolder) -> WindowStore:
+    """The windows of a run; raises FileError where they were not kept."""
+    if not folder.windows.exists():
+        raise FileError(
+            f"{folder.path}: holds no {folder.windows.name}, so what the map was fused from is gone; make the "
+            "map again with --keep-windows, or with tracked poses and without --forget"
+        )
+    store = WindowStore.open(folder.windows)
+    if not len(store):
+        raise FileError(f"{folder.windows}: holds no window; make the map again")
+    return store
+
+
+def read_new_poses(folder: RunFolder, file: Path) -> NewPoses:
+    """The poses of a file for the frames of a run: by time stamp, or by number of the frame.
+
+    Raises InputError where it has none for any of them, DatasetError or FileError where it cannot
+    be read.
+    """
+    run, before, found = read_run(folder.path), None, read_poses(file)
+    before = run.trajectory()
+    frames = np.array(run.used)
+    keys = before.timestamps if found.by_time else frames.astype(np.float64)
+    rows = nearest(found.keys, keys)
+    apart = np.abs(found.keys[rows] - keys)
+    known = apart <= (MAX_DIFFERENCE if found.by_time else 0.0)
+    if not known.any():
+        span = [f"{each[0]:.12g} to {each[-1]:.12g}" for each in (found.keys, keys)]
+        raise InputError(
+            f"{file}: has no pose of any of the {len(frames)} frames of {folder.path}; its "
+            f"{'time stamps' if found.by_time else 'numbers'} are {span[0]}, those of the run {span[1]}"
+        )
+    there = np.flatnonzero(known)
+    source = there[nearest(keys[there], keys)]  # whose motion each frame shares
+    motion = found.T_world_camera[rows[source]] @ inverse(before.T_world_camera[source])
+    T = normalized(motion @ before.T_world_camera)
+    T[known] = found.T_world_camera[rows[known]]
+    by_frame = dict(zip(frames.tolist(), T, strict=True))
+    return NewPoses(by_frame, int(known.sum()), Trajectory(before.timestamps, T))
+
+
+def repose(folder: RunFolder, windows: WindowStore, poses: NewPoses) -> tuple[Refusing, Reposed]:
+    """The maps of a run with all windows at new poses; what they are fused from is kept in
+    `folder.new_windows`.
+    """
+    folder.new_windows.unlink(missing_ok=True)
+    maps, store = Refusing(folder), WindowStore(folder.new_windows)
+    follower, moves = MapFollower(maps, store), []
+    for number in windows.resident():
+        kept = windows.windows[number]
+        target = placed(kept.frames, kept.T_keyframe_camera, poses.by_frame)
+        assert kept.place is not None
+        target = kept.place if target is None else target
+        follower.add(windows[number], target)
+        moves.append(distance(kept.place, target)[0])
+    follower.settle()
+    store.sync()
+    store.close()
+    amount = np.array(moves or [0.0])
+    return maps, Reposed(
+        len(moves), int((amount > 1e-6).sum()), float(amount.max()), float(np.median(amount))
+    )
