@@ -131,6 +131,10 @@ class BaseMap(ABC, Generic[S]):
     def fuse_voxels(self, data: VoxelData) -> None:
         """Fuse the voxels of another map into this one."""
 
+    def emptied(self) -> Self:
+        """A map of the same kind, name and settings without voxels."""
+        return self._empty(self.name, self.channels, self.settings)
+
     def save(self, path: str | Path) -> None:
         """Write the map to one file; readable on any device. Raises FileError where that fails; an
         old file then stays.

@@ -52,9 +52,7 @@ class Refusing:
 
     def __init__(self, folder: RunFolder) -> None:
         loaded = [load_map(path) for path in folder.maps.values()]
-        self.maps: dict[str, BaseMap] = {
-            each.name: type(each)._empty(each.name, each.channels, each.settings) for each in loaded
-        }
+        self.maps: dict[str, BaseMap] = {each.name: each.emptied() for each in loaded}
         self.groups: list[MapGroup] = group_maps(self.maps.values())
         self.fusion = WindowFusion(1)
 

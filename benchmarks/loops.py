@@ -1,0 +1,240 @@
+"""A map that follows its trajectory: drift is put into the poses of the house, a loop takes most of
+it out again, and four maps are compared: drifted, followed, fused at the corrected poses, and fused at
+the true poses.
+
+    python benchmarks/loops.py --data ../shared/data --paths living --drifts 0.05
+    python benchmarks/loops.py --cycles 1000            no data: a window goes and comes back so often
+
+Prints tables. Needs the extra open3d for the rate of double surfaces.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from house import PATHS
+from numpy.typing import NDArray
+from quality import DATA
+from quality_scenes import DEPTH_RANGE, Scene, house
+
+import taichi_unifusion as uf
+from taichi_unifusion.config import Config
+from taichi_unifusion.datasets.synthetic import SyntheticRoom
+from taichi_unifusion.evaluation import Viewpoints, evaluate_rendering, evaluate_surface
+from taichi_unifusion.geometry import se3
+from taichi_unifusion.maps.window_store import WindowStore
+from taichi_unifusion.pipeline import Pipeline
+from taichi_unifusion.types import Frame, Mesh
+
+WIGGLE = 0.2  # of the drift, across its direction, that no loop knows of
+TURN = np.radians(0.3) / 0.05  # [rad/m] of drift
+BEHIND = 0.10  # [m] a second surface this near behind the first is a double one
+SKIN = 0.004  # [m] behind a hit from where on the ray is looked at again
+STRIDE = 4  # pixels between the rays that ask for double surfaces
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Poses (N, 4, 4) of the frames."""
+
+    true: NDArray[np.float64]
+    drifted: NDArray[np.float64]
+    corrected: NDArray[np.float64]  # after the loop at the end: what it says is spread evenly
+
+
+def with_drift(true: NDArray[np.float64], drift: float) -> Trajectories:
+    """Poses that drift by so many metres until the last frame."""
+    share = np.linspace(0, 1, len(true))
+    along, across = np.array([0.8, 0.36, 0.48]), np.array([-0.6, 0.48, 0.64])
+    wiggle = WIGGLE * np.sin(3 * np.pi * share)
+    twist = np.zeros((len(true), 6))
+    twist[:, :3] = drift * (share[:, None] * along + wiggle[:, None] * across)
+    twist[:, 5] = TURN * drift * share
+    at = np.tile(np.eye(4), (len(true), 1, 1))
+    at[:, :3, 3] = true[:, :3, 3]  # turns are about the camera: else they would move it by metres
+    error = at @ se3.exp(twist) @ se3.inverse(at)
+    drifted = se3.normalized(error @ true)
+    end = se3.log(se3.inverse(at[-1]) @ error[-1] @ at[-1])
+    undone = at @ se3.exp(-share[:, None] * end) @ se3.inverse(at)
+    return Trajectories(true, drifted, se3.normalized(undone @ drifted))
+
+
+def at_poses(frames: Sequence[Frame], poses: NDArray[np.float64]) -> list[Frame]:
+    return [replace(frame, T_world_camera=T) for frame, T in zip(frames, poses, strict=True)]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A map, and what it took."""
+
+    pipeline: Pipeline
+    seconds: float
+    details: dict[str, float]
+
+
+def fuse(frames: Sequence[Frame], keep: WindowStore | None) -> Run:
+    """Frames as they are."""
+    pipeline = Pipeline(Config(), keep=keep)
+    for frame in frames[:2]:  # the first compile
+        pipeline.step(frame)
+    started = time.perf_counter()
+    for frame in frames[2:]:
+        pipeline.step(frame)
+    pipeline.flush()
+    return Run(pipeline, time.perf_counter() - started, {})
+
+
+def follow(run: Run, frames: Sequence[Frame], corrected: NDArray[np.float64]) -> Run:
+    """The map after the loop, whose windows went where they belong."""
+    follower, store = run.pipeline.follower, run.pipeline.fusion.keep
+    assert follower is not None and isinstance(store, WindowStore)
+    started = time.perf_counter()
+    follower.follow({frame.index: T for frame, T in zip(frames, corrected, strict=True)})
+    done = follower.finish()
+    spent = time.perf_counter() - started
+    moving = (done.seconds - done.settled) / max(done.moves, 1)
+    window = run.seconds / max(len(store), 1)
+    details = {
+        "windows": len(store),
+        "moved": done.moved,
+        "ms_a_move": 1e3 * moving,
+        "ms_a_window": 1e3 * window,
+        "move_to_window": moving / window,
+        "settle_s": done.settled,
+        "total_to_without": (run.seconds + spent) / run.seconds,
+        "kb_a_window": store.nbytes / max(len(store), 1) / 1e3,
+    }
+    return Run(run.pipeline, run.seconds + spent, details)
+
+
+def double_rate(mesh: Mesh, frames: Sequence[Frame]) -> float:
+    """Share of rays that meet a second surface within BEHIND of the first."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(mesh.vertices, mesh.faces.astype(np.uint32))
+    double = hits = 0
+    for frame in frames:
+        T, camera = frame.require_pose(), frame.camera
+        v, u = np.mgrid[0 : camera.height : STRIDE, 0 : camera.width : STRIDE].reshape(2, -1)
+        rays = camera.rays(u, v)
+        rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ T[:3, :3].T
+        first = _cast(scene, np.broadcast_to(T[:3, 3], rays.shape), rays)
+        hit = np.isfinite(first)
+        inside = T[:3, 3] + rays[hit] * (first[hit, None] + SKIN)
+        double += int((_cast(scene, inside, rays[hit]) < BEHIND - SKIN).sum())
+        hits += int(hit.sum())
+    return double / max(hits, 1)
+
+
+def _cast(scene, origins: NDArray, rays: NDArray) -> NDArray[np.float32]:
+    import open3d as o3d
+
+    both = np.hstack([origins, rays]).astype(np.float32)
+    return scene.cast_rays(o3d.core.Tensor(both))["t_hit"].numpy()
+
+
+def measure(run: Run, scene: Scene, poses: NDArray, true: NDArray) -> dict[str, float | None]:
+    """One row of the table."""
+    mesh = run.pipeline.extract_mesh()
+    near, far = DEPTH_RANGE
+    views = Viewpoints(scene.frames[0].camera, true, near, far)
+    assert scene.ground_truth is not None
+    surface = evaluate_surface(mesh, scene.ground_truth, views=views)
+    f1 = {score.threshold: score.f1 for score in surface.scores}
+    seen = evaluate_rendering(mesh, scene.held_out, color=True, depth_min=near, depth_max=far)
+    ate = np.sqrt(((poses[:, :3, 3] - true[:, :3, 3]) ** 2).sum(axis=1).mean())
+    return {
+        "ate_cm": 100 * float(ate),
+        "f1_1cm": 100 * f1[0.01],
+        "f1_2.5cm": 100 * f1[0.025],
+        "l1_cm": seen.depth_l1_cm,
+        "psnr_db": seen.psnr_db,
+        "double_%": 100 * double_rate(mesh, scene.held_out),
+        **run.details,
+    }
+
+
+def compare(scene: Scene, drift: float) -> dict[str, dict[str, float | None]]:
+    """The four maps of one path and drift."""
+    poses = with_drift(scene.T_world_camera, drift)
+    frames = list(scene.frames)
+    rows: dict[str, dict[str, float | None]] = {}
+
+    def add(name: str, run: Run, at: NDArray) -> None:
+        rows[name] = measure(run, scene, at, poses.true)
+        cells = " | ".join(
+            f"{key} {value:.3g}" for key, value in rows[name].items() if value is not None
+        )
+        print(f"{scene.name} {100 * drift:g} cm | {name} | {cells}", flush=True)
+
+    fuse(frames[:3], WindowStore())  # compiles
+    drifted = fuse(at_poses(frames, poses.drifted), WindowStore())
+    add("drifted", drifted, poses.drifted)
+    add("followed", follow(drifted, frames, poses.corrected), poses.corrected)
+    del drifted
+    add("from scratch", fuse(at_poses(frames, poses.corrected), None), poses.corrected)
+    add("true poses", fuse(frames, None), poses.true)
+    return rows
+
+
+def cycle(count: int) -> None:
+    """Take a window out and put it back elsewhere and here again, `count` times."""
+    room = SyntheticRoom(frames=120, width=160, height=120)
+    pipeline = Pipeline(replace(Config(), window=5), keep=WindowStore())
+    for i in range(10):
+        pipeline.step(room[i])
+    pipeline.flush()
+    follower, store = pipeline.follower, pipeline.fusion.keep
+    assert follower is not None and isinstance(store, WindowStore)
+    before = {name: each.voxels() for name, each in pipeline.maps.items()}
+    home = store.windows[1].T_world_keyframe
+    there = se3.exp(np.array([0.02, -0.01, 0.015, 0.01, 0.0, -0.02])) @ home
+    for _ in range(count):
+        for place in (there, home):
+            follower.move_to({1: place})
+            follower.work(np.inf)
+    for name, each in pipeline.maps.items():
+        now = each.voxels()
+        same = len(now) == len(before[name]) and all(
+            np.array_equal(now.tensors[part], before[name].tensors[part])
+            for part in ("keys", "latents", "weights", "masks")
+        )
+        print(f"{name}: after {count} cycles {'the same to the bit' if same else 'CHANGED'}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--paths", nargs="+", default=list(PATHS), choices=list(PATHS))
+    parser.add_argument("--drifts", nargs="+", type=float, default=[0.02, 0.05, 0.10])
+    parser.add_argument("--frames", type=int, help="about how many frames (default: every 5th)")
+    parser.add_argument("--cycles", type=int, help="only move one window so often")
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--threads", type=int, help="CPU threads of Taichi (default: all)")
+    parser.add_argument("--out", type=Path, help="file for the numbers, JSON")
+    options = parser.parse_args()
+    uf.init(threads=options.threads)
+    if options.cycles:
+        cycle(options.cycles)
+        return 0
+    results = {}
+    for path in options.paths:
+        scene = house(path, options.data, options.frames)
+        scene = replace(scene, frames=[scene.frames[i] for i in range(len(scene.frames))])
+        for drift in options.drifts:
+            results[f"{path} {drift:g}"] = compare(scene, drift)
+            if options.out:
+                options.out.write_text(json.dumps(results, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
