@@ -148,7 +148,8 @@ def measure(run: Run, scene: Scene, poses: NDArray, true: NDArray) -> dict[str, 
     assert scene.ground_truth is not None
     surface = evaluate_surface(mesh, scene.ground_truth, views=views)
     f1 = {score.threshold: score.f1 for score in surface.scores}
-    seen = evaluate_rendering(mesh, scene.held_out, color=True, depth_min=near, depth_max=far)
+    color = run.pipeline.properties["color"].query
+    seen = evaluate_rendering(mesh, scene.held_out, color=color, depth_min=near, depth_max=far)
     ate = np.sqrt(((poses[:, :3, 3] - true[:, :3, 3]) ** 2).sum(axis=1).mean())
     return {
         "ate_cm": 100 * float(ate),

@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from ..config import Config
 from ..datasets import Dataset
 from ..types import Trajectory
 from .color_camera import AUTO
-from .options import OutputOptions
+from .options import OutputOptions, RecordingOptions, TrackingOptions
 from .terminal import frame_progress
 
 if TYPE_CHECKING:
@@ -24,9 +24,21 @@ if TYPE_CHECKING:
     from ..run_log import RunResult
     from ..tracking import CurrentPoses
     from ..viewer.null import Watcher
-    from .reconstruct import Reconstruct
 
 logger = logging.getLogger(__name__)
+
+
+class Asked(Protocol):
+    """The options of a command that tracks and maps."""
+
+    @property
+    def recording(self) -> RecordingOptions: ...
+    @property
+    def poses(self) -> TrackingOptions: ...
+    @property
+    def output(self) -> OutputOptions: ...
+    @property
+    def settings(self) -> Config: ...
 
 
 @dataclass(frozen=True)
@@ -39,7 +51,7 @@ class Mapped:
     written: tuple[Path, ...]  # files that are in the folder already
 
 
-def in_one_pass(recording: Dataset, options: Reconstruct) -> bool:
+def in_one_pass(recording: Dataset, options: Asked) -> bool:
     """Whether frames are tracked and fused in one pass: asked for, and possible."""
     poses = options.poses
     if not poses.tracked or poses.tracking_passes == 2:
@@ -63,14 +75,18 @@ def _obstacle(settings: Config) -> str:
     return ""
 
 
-def open_store(folder: RunFolder, options: OutputOptions, settings: Config) -> WindowStore | None:
-    """A file for what windows are fused from, under a name for the time being; None where it is not
-    wanted.
+def open_store(
+    folder: RunFolder, options: OutputOptions, settings: Config, *, moves: bool
+) -> WindowStore | None:
+    """A file for what windows are fused from, under a name for the time being; where it is not
+    wanted, memory if the map `moves`, else None.
     """
     from ..maps.window_store import WindowStore
 
-    if options.forget or _obstacle(settings):
+    if _obstacle(settings):
         return None
+    if options.forget:
+        return WindowStore() if moves else None
     folder.new_windows.unlink(missing_ok=True)
     return WindowStore(folder.new_windows)
 
@@ -88,7 +104,7 @@ def keep_store(folder: RunFolder, store: WindowStore | None) -> tuple[Path, ...]
 
 def map_in_one_pass(
     recording: Dataset,
-    options: Reconstruct,
+    options: Asked,
     folder: RunFolder,
     stop: Callable[[], bool],
     encoder: ImageEncoder | None,
@@ -99,7 +115,6 @@ def map_in_one_pass(
     """
     from .. import runtime
     from ..files.trajectories import write_trajectory
-    from ..maps.window_store import WindowStore
     from ..pipeline import Pipeline
     from ..tracking.online import OnlineFrames
     from ..tracking.sequence import concluded, say_warnings, write_tracking
@@ -107,8 +122,8 @@ def map_in_one_pass(
     poses, settings, started = options.poses, options.settings, time.perf_counter()
     runtime.init(settings.device, threads=settings.threads or None)
     tracker = _tracker(options)
-    store = open_store(folder, options.output, settings)
-    pipeline = Pipeline(settings, encoder=encoder, keep=WindowStore() if store is None else store)
+    store = open_store(folder, options.output, settings, moves=True)
+    pipeline = Pipeline(settings, encoder=encoder, keep=store)
     frames = OnlineFrames(recording, tracker, options.recording.every, following(pipeline))
     logger.info("tracking: %s, in one pass with mapping", poses.tracking)
     warnings = say_warnings(frames.frames, tracker)
@@ -141,7 +156,7 @@ def map_in_one_pass(
     return Mapped(pipeline, run, details, written)
 
 
-def _tracker(options: Reconstruct) -> Any:
+def _tracker(options: Asked) -> Any:
     from ..tracking import make_tracker
 
     poses, settings = options.poses, options.settings
@@ -159,16 +174,17 @@ def following(pipeline: Pipeline) -> Callable[[CurrentPoses], None]:
     """What ends the open window and lets the map follow when a tracker has moved earlier frames."""
 
     def on_moved(poses: CurrentPoses) -> None:
-        assert pipeline.follower is not None
-        pipeline.fusion.close()
-        pipeline.follower.follow(poses.by_frame)
+        if pipeline.follower is not None:
+            pipeline.fusion.close()
+            pipeline.follower.follow(poses.by_frame)
 
     return on_moved
 
 
 def settle(pipeline: Pipeline, run: RunResult, poses: CurrentPoses) -> RunResult:
-    """Move all windows to the final poses; returns the run with these."""
-    assert pipeline.follower is not None
+    """Move all windows to the final poses, if they were kept; returns the run with these."""
+    if pipeline.follower is None:
+        return run
     final = poses.by_frame
     pipeline.follower.follow(final)
     followed = pipeline.follower.finish()

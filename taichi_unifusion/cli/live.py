@@ -18,6 +18,7 @@ from ..tracking import Mode, TrackingResult, check_poses, make_tracker
 from ..tracking.live import TrackedFrames
 from ..tracking.live import warm_up as warm_up_tracker
 from .color_camera import AUTO, given_color
+from .following import following, keep_store, open_store, settle
 from .interrupts import INTERRUPTED, stop_on_signal
 from .options import (
     OutputOptions,
@@ -147,7 +148,9 @@ def _map(
     from ..results.summary import summarize
     from ..results.writer import write_results
 
-    pipeline = Pipeline(settings)
+    moves = source.tracking != "given"
+    store = open_store(folder, output, settings, moves=True) if moves else None
+    pipeline = Pipeline(settings, keep=store)
     tracker = make_tracker(source.tracking, settings.tracking, settings.preprocess)
     logger.info("live: %s, tracking: %s; Ctrl-C ends it", source.name, source.tracking)
     with (
@@ -155,7 +158,7 @@ def _map(
         frame_progress(source.most or 0) as on_frame,
     ):
         run = pipeline.run(
-            TrackedFrames(frames, tracker),
+            TrackedFrames(frames, tracker, following(pipeline)),
             strict=strict,
             stop=stop,
             on_frame=on_frame,
@@ -170,7 +173,9 @@ def _map(
         logger.warning("stopped before the first frame was done; nothing was written")
         return INTERRUPTED
     result = tracker.finish()
+    run = settle(pipeline, run, tracker.current_poses())
     written = _write_tracking(folder, result) if source.tracking != "given" else ()
+    written = (*written, *keep_store(folder, store))
     details = {
         **result.details,
         "mode": source.tracking,

@@ -248,9 +248,10 @@ def _map(
     """Fuse frames at the poses that they have."""
     from ..pipeline import Pipeline
 
-    keep, store = options.output.keep_windows, None
-    if keep:
-        store = open_store(folder, options.output, options.settings, moves=False)
+    output, store = options.output, None
+    if output.keep_windows:
+        store = open_store(folder, output, options.settings, moves=False)
+    if store is not None:
         pipeline = Pipeline(options.settings, encoder=encoder, keep=store)
     else:
         pipeline = make_pipeline(options, encoder, folder, saver)
@@ -262,7 +263,7 @@ def _map(
             on_frame=on_frame,
             on_step=watcher.on_step,
             on_skip=watcher.on_skip,
-            on_border=None if keep else saver.at_border,
+            on_border=saver.at_border if store is None else None,
             before=saver.resumed and saver.resumed.so_far,
         )
     return Mapped(pipeline, run, None, keep_store(folder, store))

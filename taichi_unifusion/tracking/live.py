@@ -10,7 +10,7 @@ import numpy as np
 from ..datasets.live import Arriving
 from ..errors import FrameError, PoseError
 from ..types import Frame, PinholeCamera
-from .base import Tracker
+from .base import CurrentPoses, Tracker
 
 
 def warm_up(tracker: Tracker) -> None:
@@ -27,12 +27,18 @@ class TrackedFrames(Arriving):
     """Frames as they arrive, with the pose that a tracker finds for each; one without raises PoseError
     that says why.
 
-    Poses are those known at the time: a loop that is closed later moves the trajectory of
-    `tracker.finish()`, not what is mapped already.
+    Poses are those known at the time; `on_moved` is told where all frames are whenever a loop has
+    moved earlier ones.
     """
 
-    def __init__(self, frames: Arriving, tracker: Tracker) -> None:
-        self.frames, self.tracker = frames, tracker
+    def __init__(
+        self,
+        frames: Arriving,
+        tracker: Tracker,
+        on_moved: Callable[[CurrentPoses], None] = lambda poses: None,
+    ) -> None:
+        self.frames, self.tracker, self.on_moved = frames, tracker, on_moved
+        self._version = tracker.version
         self.name, self.warnings = frames.name, (*frames.warnings, *tracker.warnings)
 
     def __len__(self) -> int:
@@ -51,6 +57,9 @@ class TrackedFrames(Arriving):
         if self.tracker.uses_given_poses is False:
             frame = replace(frame, T_world_camera=None)
         tracked = self.tracker.track(frame)
+        if self.tracker.version != self._version:
+            self._version = self.tracker.version
+            self.on_moved(self.tracker.current_poses())
         if tracked.T_world_camera is None:
             raise PoseError(f"{frame.label}: {tracked.verdict}, {tracked.message}")
         return replace(frame, T_world_camera=tracked.T_world_camera)
