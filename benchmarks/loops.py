@@ -4,6 +4,7 @@ the true poses.
 
     python benchmarks/loops.py --data ../shared/data --paths living --drifts 0.05
     python benchmarks/loops.py --cycles 1000            no data: a window goes and comes back so often
+    python benchmarks/loops.py --kept synthetic kitchen     what keeping and moving does to a map; bytes
 
 Prints tables. Needs the extra open3d for the rate of double surfaces.
 """
@@ -21,14 +22,15 @@ import numpy as np
 from house import PATHS
 from numpy.typing import NDArray
 from quality import DATA
-from quality_scenes import DEPTH_RANGE, Scene, house
+from quality_scenes import DEPTH_RANGE, SCENES, Scene, house
 
 import taichi_unifusion as uf
 from taichi_unifusion.config import Config
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.evaluation import Viewpoints, evaluate_rendering, evaluate_surface
+from taichi_unifusion.files.record_file import pack
 from taichi_unifusion.geometry import se3
-from taichi_unifusion.maps.window_store import WindowStore
+from taichi_unifusion.maps.window_store import WindowStore, to_record
 from taichi_unifusion.pipeline import Pipeline
 from taichi_unifusion.types import Frame, Mesh
 
@@ -185,6 +187,68 @@ def compare(scene: Scene, drift: float) -> dict[str, dict[str, float | None]]:
     return rows
 
 
+def kept(scene: Scene) -> None:
+    """A map as usual; one that keeps windows; with all votes cast anew, from small images; and with all
+    windows moved off the lattice that they were summed up in, by 1.7 cm and a degree. Then bytes.
+    """
+    frames = list(scene.frames)
+    T = se3.exp(np.array([0.01, -0.008, 0.011, 0.01, 0.012, -0.008]))
+    fuse(frames[:3], WindowStore())  # compiles
+
+    def add(name: str, run: Run, T_now: NDArray) -> None:
+        mesh = run.pipeline.extract_mesh()
+        colors = run.pipeline.properties["color"].query
+        seen = evaluate_rendering(
+            mesh.transformed(se3.inverse(T_now)),
+            scene.held_out,
+            color=lambda points: colors(points @ T_now[:3, :3].T + T_now[:3, 3]),
+            depth_min=DEPTH_RANGE[0],
+            depth_max=DEPTH_RANGE[1],
+        )
+        row = f"l1_cm {seen.depth_l1_cm:.3f} | coverage {seen.coverage:.4f} | psnr_db {seen.psnr_db:.2f}"
+        if scene.ground_truth is not None:
+            views = Viewpoints(frames[0].camera, scene.T_world_camera, *DEPTH_RANGE)
+            truth = scene.ground_truth
+            moved = mesh.transformed(se3.inverse(T_now))
+            scores = evaluate_surface(moved, truth, views=views).scores
+            row += "".join(
+                f" | f1_{100 * each.threshold:g}cm {100 * each.f1:.2f}" for each in scores
+            )
+        print(
+            f"{scene.name} | {name} | {row} | {1e3 * run.seconds / len(frames):.0f} ms", flush=True
+        )
+
+    add("usual", fuse(frames, None), np.eye(4))
+    run = fuse(frames, WindowStore())
+    add("kept", run, np.eye(4))
+    follower = run.pipeline.follower
+    assert follower is not None
+    follower.settle()
+    add("votes anew", run, np.eye(4))
+    follower.move_to(
+        {n: T @ each.T_world_keyframe for n, each in enumerate(follower.store.windows)}
+    )
+    follower.finish()
+    add("moved", run, T)
+    for size in sizes(follower.store):
+        print(f"{scene.name} | {size}")
+
+
+def sizes(store: WindowStore) -> list[str]:
+    """Bytes of the first full window, compressed, by what they are of."""
+    number = max(range(len(store)), key=lambda n: len(store.windows[n].frames))
+    values, arrays = to_record(store[number])
+    of: dict[str, int] = {}
+    for name, array in arrays.items():
+        what = name.partition(".")[0]
+        of[what] = of.get(what, 0) + len(pack({}, {name: array}))
+    names = {f"part{i}": " + ".join(part["names"]) for i, part in enumerate(values["parts"])}
+    frames = len(store.windows[number].frames)
+    parts = [f"{names.get(what, what)} {size / 1e3:.0f} kB" for what, size in of.items()]
+    minute = sum(of.values()) / frames * 30 * 60 / 1e6
+    return [f"a window of {frames} frames: {', '.join(parts)}; {minute:.0f} MB a minute at 30 Hz"]
+
+
 def cycle(count: int) -> None:
     """Take a window out and put it back elsewhere and here again, `count` times."""
     room = SyntheticRoom(frames=120, width=160, height=120)
@@ -218,6 +282,7 @@ def main() -> int:
     parser.add_argument("--drifts", nargs="+", type=float, default=[0.02, 0.05, 0.10])
     parser.add_argument("--frames", type=int, help="about how many frames (default: every 5th)")
     parser.add_argument("--cycles", type=int, help="only move one window so often")
+    parser.add_argument("--kept", nargs="+", choices=list(SCENES), metavar="SCENE")
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--threads", type=int, help="CPU threads of Taichi (default: all)")
     parser.add_argument("--out", type=Path, help="file for the numbers, JSON")
@@ -225,6 +290,10 @@ def main() -> int:
     uf.init(threads=options.threads)
     if options.cycles:
         cycle(options.cycles)
+        return 0
+    if options.kept:
+        for name in options.kept:
+            kept(SCENES[name](options.data, options.frames))
         return 0
     results = {}
     for path in options.paths:
