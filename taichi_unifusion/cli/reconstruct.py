@@ -94,7 +94,9 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     check_poses(recording, options.poses.tracking, options.poses.trajectory)
     if options.cluster.wanted and options.output.resume:
         raise InputError("--resume: a run on several workers cannot go on; leave one of them out")
-    if options.output.resume and (options.output.keep_windows or options.poses.tracking_passes == 1):
+    if options.output.resume and (
+        options.output.keep_windows or options.poses.tracking_passes == 1
+    ):
         raise InputError(
             "--resume: a run that keeps windows (--keep-windows, --tracking-passes 1) cannot go on yet; leave "
             "--resume out"

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class Repose:
     """Move a finished map to other poses, as those of your own pose graph, without the images.
 
-    Needs windows.log in the results folder, which runs with tracked poses keep, and others with
-    --keep-windows.
+    Needs windows.log in the results folder, which runs with --keep-windows leave there, and those
+    with --tracking-passes 1.
 
     Example: unifusion repose results/kitchen --trajectory optimised.txt --out results/optimised
     """

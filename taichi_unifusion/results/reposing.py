@@ -62,7 +62,7 @@ def read_windows(folder: RunFolder) -> WindowStore:
     if not folder.windows.exists():
         raise FileError(
             f"{folder.path}: holds no {folder.windows.name}, so what the map was fused from is gone; make the "
-            "map again with --keep-windows, or with tracked poses and without --forget"
+            "map again with --keep-windows"
         )
     store = WindowStore.open(folder.windows)
     if not len(store):

@@ -23,7 +23,18 @@ SHIFTED = 0.02  # [m] windows that a turn moves off the lattice of their cells a
 def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("one-pass") / "results"
     code = main(
-        ["reconstruct", "synthetic", *RECORDING, *SMALL, "--tracking", "rgbd", "--out", str(folder)]
+        [
+            "reconstruct",
+            "synthetic",
+            *RECORDING,
+            *SMALL,
+            "--tracking",
+            "rgbd",
+            "--tracking-passes",
+            "1",
+            "--out",
+            str(folder),
+        ]
     )
     assert code == 0
     return folder
