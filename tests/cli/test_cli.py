@@ -110,7 +110,8 @@ def files_in(folder: Path) -> list[str]:
             [],
             2,
             [
-                "reconstruct, transfer, understand, query, segment, view, render, mesh, merge, batch, export,",
+                "reconstruct, transfer, understand, query, segment, view, render, mesh, merge, batch,",
+                "repose,",
                 "info, formats, config",
             ],
         ),
