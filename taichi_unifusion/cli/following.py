@@ -167,6 +167,7 @@ def _tracker(options: Asked) -> Any:
         trajectory=poses.trajectory,
         interpolate=poses.interpolate,
         max_difference=options.recording.max_difference,
+        body_camera=poses.body_camera,
     )
 
 
