@@ -8,60 +8,17 @@ A few mutations of each in the suite; UNIFUSION_FUZZ=2000 asks for as many of ea
 from __future__ import annotations
 
 import os
-import resource
-import shutil
-import signal
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import bag_writer as bags
 import numpy as np
 import pytest
 from dataset_writers import START, make_samples
+from fuzzing import fuzz
 from open3d_writer import TRAJECTORIES, write_recording
 from realsense_writer import write_realsense
 
-from taichi_unifusion.datasets import open_dataset
-from taichi_unifusion.errors import FrameError, UniFusionError
-
 MUTATIONS = int(os.environ.get("UNIFUSION_FUZZ", "6"))
-LONGEST = 20  # [s] for one recording of some kilobytes, on a busy machine; a hang takes for ever
-MOST_BYTES = 1 << 30  # that a damaged header may ask for
-EXTREMES = [0, 1, 0x7F, 0x80, 0xFF]
-WORDS = [b"\xff" * 4, b"\x00" * 4, b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8]
-
-
-def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """The bytes with one to four faults: bits, extreme numbers, cuts, pieces that are gone, doubled or
-    moved.
-    """
-    content = bytearray(data)
-    for _ in range(rng.integers(1, 5)):
-        if not content:
-            break
-        # half of them near the start, where headers are
-        reach = len(content) if rng.random() < 0.5 else min(len(content), 2000)
-        at, kind = int(rng.integers(reach)), rng.integers(7)
-        length = int(rng.integers(1, 64))
-        if kind == 0:
-            content[at] ^= 1 << int(rng.integers(8))
-        elif kind == 1:
-            content[at] = int(rng.choice(EXTREMES))
-        elif kind == 2:
-            word = WORDS[int(rng.integers(len(WORDS)))]
-            content[at : at + len(word)] = word
-        elif kind == 3:
-            del content[at:]
-        elif kind == 4:
-            del content[at : at + length]
-        elif kind == 5:
-            content[at:at] = content[at : at + length]
-        else:
-            other = int(rng.integers(len(content)))
-            content[at : at + length] = content[other : other + length]
-    return bytes(content)
 
 
 def bag_of_all_encodings(folder: Path, container: str) -> Path:
@@ -113,43 +70,8 @@ RECORDINGS = {
 }
 
 
-def outcome(format: str, path: Path) -> str:
-    """What becomes of a recording: every error that is not ours comes through."""
-    try:
-        dataset = open_dataset(format, path)
-    except UniFusionError as error:
-        assert len(str(error)) < 5000
-        return "refused"
-    read = 0
-    for i in range(len(dataset)):
-        try:
-            frame = dataset[i]
-        except FrameError as error:
-            assert len(str(error)) < 5000
-            continue
-        assert np.isfinite(frame.depth).all() and (frame.depth >= 0).all()
-        read += 1
-    return "all read" if read == len(dataset) and read else "some read" if read else "none read"
-
-
-@contextmanager
-def less_memory() -> Iterator[None]:
-    """Whoever asks for MOST_BYTES more than there are gets a MemoryError."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MOST_BYTES, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-def too_long(number, frame):
-    raise AssertionError(f"hangs: more than {LONGEST} s")
-
-
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_i1_damaged_recordings(name, tmp_path):
+def test_i1_damaged_recordings(name, tmp_path, request):
     pytest.importorskip("rosbags", reason="bags are written and read with rosbags, extra 'ros'")
     format, write, container = RECORDINGS[name]
     (tmp_path / "base").mkdir()
@@ -157,24 +79,7 @@ def test_i1_damaged_recordings(name, tmp_path):
     files = [base] if base.is_file() else [f for f in sorted(base.rglob("*")) if f.is_file()]
     if container not in ("trajectory.log", "trajectory.json"):  # of a bag: not its description
         files = [file for file in files if file.suffix in (".bag", ".mcap", ".db3")]
-    found, rng = Counter(), np.random.default_rng(sum(map(ord, name)))
-    before = signal.signal(signal.SIGALRM, too_long)
-    try:
-        for n in range(MUTATIONS):
-            damaged = tmp_path / f"d{n}"
-            shutil.copytree(base, damaged) if base.is_dir() else damaged.mkdir()
-            file = files[int(rng.integers(len(files)))]
-            relative = file.relative_to(base) if base.is_dir() else Path(file.name)
-            (damaged / relative).write_bytes(mutated(file.read_bytes(), rng))
-            path = damaged if base.is_dir() else damaged / relative
-            signal.alarm(LONGEST)
-            try:
-                with less_memory():
-                    found[outcome(format, path)] += 1
-            finally:
-                signal.alarm(0)
-            shutil.rmtree(damaged)  # one that fails stays in pytest's folder
-    finally:
-        signal.signal(signal.SIGALRM, before)
+    seed, kept = sum(map(ord, name)), Path(request.config.rootpath) / "fuzz-failure"
+    found = fuzz(format, base, files, MUTATIONS, seed, tmp_path, kept)
     print(f"{name}: {dict(found)}")
     assert found.total() == MUTATIONS
