@@ -68,7 +68,7 @@ def _read_binary(path: Path) -> list[PoseRow]:
             end = data.index(b"\0", at + IMAGE.size, at + IMAGE.size + LONGEST_NAME)
             name = data[at + IMAGE.size : end].decode()
             points = int.from_bytes(data[end + 1 : end + 9], "little")
-        except (struct.error, ValueError):
+        except (struct.error, ValueError, OverflowError):
             raise DatasetError(f"{path}: not a list of images of COLMAP, or cut off") from None
         at = end + 9 + POINT_BYTES * points
         rows.append(_row(name, numbers, f"{path}, image {i}"))
