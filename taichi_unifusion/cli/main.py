@@ -26,6 +26,7 @@ from ..config import Config, config_of, load_config
 from ..datasets.doctor.fix import read_fix
 from ..errors import FileError, UniFusionError, as_known, check_choice
 from .batch import Batch, batch
+from .check import Check, check
 from .config import ShowConfig, show_config
 from .convert import Convert, convert
 from .evaluate import METRICS, Evaluate
@@ -57,6 +58,7 @@ DESCRIPTION = (
 Commands = dict[str, tuple[type, Callable[..., int] | dict[str, Any]]]
 
 COMMANDS: Commands = {
+    "check": (Check, check),
     "reconstruct": (Reconstruct, reconstruct),
     "transfer": (Transfer, transfer),
     "understand": (Understand, understand),

@@ -110,7 +110,9 @@ class RecordingOptions:
     ] = None
     """Seconds to add to a frame's time stamp before its pose is looked up."""
     fix: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
-    """What `unifusion check --fix FILE` wrote for this recording; options given here count more."""
+    """Answers on this recording: `unifusion check` writes them there, other commands take them; options
+    given here count more.
+    """
     color_camera: ColorChoice = AUTO
     """Where the colour camera stands. auto: found from the frames, and used if colour then fits depth better in
     frames left out; FILE: your calibration; kinect: a Kinect's nominal one; none: colour as recorded.

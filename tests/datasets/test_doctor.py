@@ -1,0 +1,94 @@
+"""The doctor on synthetic frames spoiled in every way: the right cause, and no other; nothing on
+sound ones. `benchmarks/doctor.py` does the same on real recordings.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from tiny_recording import write_folder
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+
+import doctor as bench
+
+from taichi_unifusion.cli import main as cli
+from taichi_unifusion.datasets import open_dataset
+from taichi_unifusion.datasets.doctor import CAUSES, Fix, examine
+from taichi_unifusion.datasets.doctor.color import find_shift
+from taichi_unifusion.datasets.pose_readings import FLIP_YZ
+from taichi_unifusion.datasets.synthetic import SyntheticRoom
+
+# a steady walk: poses of a moment later fit nearly as well
+NOT_SEEN = {"clock 0.2 s late", "clock 0.3 s early"}
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return list(SyntheticRoom(frames=100, width=160, height=120)[:12])
+
+
+def test_sound_frames_are_sound(frames):
+    diagnosis = bench.examined(frames)
+    assert diagnosis.sound and diagnosis.findings == () and diagnosis.fix == Fix()
+    assert "160x120" in diagnosis.facts["depth"] and "12" in diagnosis.facts["frames"]
+
+
+@pytest.mark.parametrize("title", [title for title in bench.SPOILINGS if title not in NOT_SEEN])
+def test_the_right_cause_is_named_and_no_other(frames, title):
+    spoiling = bench.SPOILINGS[title]
+    diagnosis = bench.examined(spoiling.change(frames), spoiling.depth_scale)
+    named = {finding.cause for finding in diagnosis.findings}
+    assert named == {spoiling.cause}, [finding.sentence for finding in diagnosis.findings]
+    assert named <= set(CAUSES)
+
+
+def test_answers_mend_what_they_were_given_for(frames, tmp_path, capsys):
+    spoiled = bench.by_pose(lambda T: np.linalg.inv(T @ FLIP_YZ))(bench.longer(100)(frames))
+    folder = write_folder(tmp_path / "r", spoiled)
+    fix = tmp_path / "fix.yaml"
+    assert cli.main(["check", "folder", str(folder), "--fix", str(fix)]) == 2
+    out = capsys.readouterr().out
+    assert "OpenGL" in out and "--pose-reading w2c+opengl --pose-scale 0.01" in out
+    assert yaml.safe_load(fix.read_text())["recording"] == {
+        "pose_reading": "w2c+opengl",
+        "pose_scale": 0.01,
+    }
+    options = ["--pose-reading", "w2c+opengl", "--pose-scale", "0.01"]
+    assert cli.main(["check", "folder", str(folder), *options, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sound"] is True
+
+
+def test_a_recording_that_cannot_be_opened_is_a_finding(frames, tmp_path, capsys):
+    folder = write_folder(tmp_path / "r", frames[:4])
+    (folder / "camera.yaml").unlink()
+    assert cli.main(["check", "folder", str(folder)]) == 2
+    assert "camera.yaml: no such file" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", list(bench.ON_DISK))
+def test_odd_time_stamps_are_said(frames, name):
+    assert bench.on_disk(name, frames) == {bench.ON_DISK[name]}
+
+
+def test_frames_that_cannot_be_read_are_counted(frames, tmp_path):
+    folder = write_folder(tmp_path / "r", frames[:5])
+    (folder / "depth" / "3.png").write_bytes(b"nothing")
+    diagnosis = examine(open_dataset("folder", folder))
+    assert [f.cause for f in diagnosis.findings] == ["unreadable"]
+    assert "1 of 5 frames" in diagnosis.findings[0].sentence
+
+
+def test_how_far_colour_is_off(frames):
+    for right, down in ((16, 0), (-20, 12)):
+        found = find_shift(bench.beside(right, down)(frames))
+        # half of it in images 320 pixels wide; textures pull by a few pixels
+        np.testing.assert_allclose(found, (right / 2, down / 2), atol=4)
+    grey = [replace(f, color=np.full_like(f.color, 90)) for f in frames]
+    assert find_shift(grey) is None
