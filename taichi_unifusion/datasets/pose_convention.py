@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Frame
-from .pose_fit import NOTHING, Fit, PosePairs, View, compare, has_moved
+from .pose_fit import Fit, PosePairs, has_moved
 from .pose_readings import AS_READ, FLIP_YZ, NAMES, SINGLE, describe, read_as
 
 # Chosen by the worst of the synthetic room, the kitchen, TUM's desk and nine stretches of a house: right poses
@@ -91,14 +91,6 @@ def unit_of_scale(scale: float) -> str | None:
         if abs(scale / metres - 1) <= UNIT_TOLERANCE:
             return name
     return None
-
-
-def agreement(a: Frame, b: Frame, T_b_a: NDArray[np.float64]) -> tuple[float, float]:
-    """Share of the points that two frames can compare which agree, and the share of all points that
-    were compared.
-    """
-    fit = compare(View(a), View(b), T_b_a)
-    return fit.share, fit.compared
 
 
 def guess_pose_convention(a: Frame, b: Frame) -> tuple[bool, str | None]:
@@ -204,9 +196,7 @@ def refined_scale(
 
 __all__ = [
     "FLIP_YZ",
-    "NOTHING",
     "PoseVerdict",
-    "agreement",
     "guess_pose_convention",
     "has_moved",
     "judge_poses",

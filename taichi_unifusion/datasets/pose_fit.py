@@ -19,7 +19,8 @@ from .plausibility import is_reading
 
 GRID = 32  # points along each image axis
 NEAREST = 0.02  # of the median depth; nothing nearer to a camera is compared
-TOLERANCE = 0.03  # share of the depth within which two measurements agree
+# share of the depth within which two measurements agree, and what a sensor may be off by however near [m]
+TOLERANCE, LEAST_TOLERANCE = 0.03, 0.02
 MIN_POINTS = 100  # compared in a pair; with fewer it says nothing
 MIN_MOTION = 0.05, np.radians(3)  # [m], [rad]; with less, all readings of poses agree
 MOST_PAIRS = 6  # of early frames
@@ -140,10 +141,12 @@ def _count(
     nearest = NEAREST * other.median
     measured, inside = (camera or other.camera).look_up(other.depth, points, nearest)
     wanted = points[inside, 2]
-    beyond = (measured[measured > 0] - wanted[measured > 0]) / wanted[measured > 0]
-    close = 1 - np.abs(beyond) / TOLERANCE
+    measured, wanted = measured[measured > 0], wanted[measured > 0]
+    # how much farther a view sees, in tolerances
+    beyond = (measured - wanted) / np.maximum(TOLERANCE * wanted, LEAST_TOLERANCE)
+    close = 1 - np.abs(beyond)
     agree = close > 0
-    return np.array([len(points), agree.sum(), (beyond >= TOLERANCE).sum(), close[agree].sum()])
+    return np.array([len(points), agree.sum(), (beyond >= 1).sum(), close[agree].sum()])
 
 
 class EarlyPairs:
