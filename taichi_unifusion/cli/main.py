@@ -1,8 +1,8 @@
 """`unifusion`: finds the subcommand, and is the only place that catches UniFusionError.
 
-Exit codes: 0 done; 2 bad input, or an output that could not be written; 130 stopped by Ctrl-C or
-SIGTERM; 1 a bug. What needs Taichi is imported where it is used, so that `--help` is there at once.
-UNIFUSION_DEBUG=1 shows tracebacks.
+Exit codes: 0 done; 2 bad input, for `check` also a recording with something wrong, or an output that
+could not be written; 130 stopped by Ctrl-C or SIGTERM; 1 a bug. What needs Taichi is imported where
+it is used, so that `--help` is there at once. UNIFUSION_DEBUG=1 shows tracebacks.
 """
 
 from __future__ import annotations

@@ -48,9 +48,10 @@ def examine(recording: Dataset) -> Diagnosis:
     if sample.frames:
         unit = depth_findings(sample)
         findings += unit
-        findings += frame_findings(sample)
-        # poses in metres cannot fit a depth whose unit is wrong
-        if not any(each.cause == "depth-scale" for each in unit):
+        pictures = frame_findings(sample)
+        findings += pictures
+        # poses in metres cannot fit a depth whose unit is wrong, nor those of other pictures
+        if not {each.cause for each in (*unit, *pictures)} & {"depth-scale", "repeated", "still"}:
             findings += pose_findings(sample)
         findings += color_findings(sample)
     return Diagnosis(facts_of(sample), tuple(findings))

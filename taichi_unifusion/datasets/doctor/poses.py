@@ -46,9 +46,10 @@ from .sampling import Sample
 OFFSETS = np.arange(-1.0, 1.001, 0.04)  # [s] that clocks may be apart
 LEAST_OFFSET = 0.03  # [s]
 FOCALS = np.geomspace(0.4, 2.5, 19)  # factors of another resolution's intrinsics
+SMALL_MOTION = 0.02, np.radians(1)  # [m], [rad]; with less a frame in another's place is no harm
 LEAST_FOCAL = 1.12  # factor
 SAME_FACTOR = 0.1  # relative, of the two axes' factors and the focal length's
-KNOWN_RATIO = 0.04  # relative: how near a factor of depth must be to a usual unit's
+KNOWN_RATIO = 0.1  # relative: how near a factor of depth must be to a usual unit's
 OUTLIER, ORDINARY = (
     0.55,
     0.8,
@@ -186,22 +187,29 @@ def clock_offset(
         return []
     at = [float(sample.times[sample.places[i]]) for i in used]
 
-    def fit(offset: float) -> Fit:
-        T = [pose_at_time(times, poses, time + offset) for time in at]
-        usable = [(a, b) for a, b in pairs.pairs if T[a] is not None and T[b] is not None]
-        if len(usable) < max(2, len(pairs.pairs) // 2):
-            return NOTHING
-        return mean_fit([_fit_of(pairs, a, b, T[a], T[b]) for a, b in usable])
+    own = pairs.fits()
 
-    scored = [(offset, fit(offset)) for offset in OFFSETS]
-    best, found = max(scored, key=lambda item: item[1].closeness)
+    def fit(offset: float) -> tuple[Fit, Fit]:
+        """With the poses of that much later, and with the given ones on the same pairs."""
+        T = [pose_at_time(times, poses, time + offset) for time in at]
+        usable = [
+            k for k, (a, b) in enumerate(pairs.pairs) if T[a] is not None and T[b] is not None
+        ]
+        if len(usable) < max(2, len(own) // 2):
+            return NOTHING, NOTHING
+        there = [_fit_of(pairs, *pairs.pairs[k], T) for k in usable]
+        return mean_fit(there), mean_fit([own[k] for k in usable])
+
+    scored = [(offset, *fit(offset)) for offset in OFFSETS]
+    best, found, before = max(scored, key=lambda item: item[1].closeness - item[2].closeness)
     step = 0.02
     while step > 0.002:
         for other in (best - step, best + step):
-            if (new := fit(other)).closeness > found.closeness:
-                best, found = other, new
+            new, same = fit(other)
+            if new.closeness - same.closeness > found.closeness - before.closeness:
+                best, found, before = other, new, same
         step /= 2
-    if abs(best) < LEAST_OFFSET:
+    if abs(best) < LEAST_OFFSET or not better(found, before):
         return []
     sentence = (
         f"depth agrees with the poses on {given.share:.0%} of the points, on {found.share:.0%} with the poses of "
@@ -214,7 +222,8 @@ def clock_offset(
     return [Hypothesis(found, finding)]
 
 
-def _fit_of(pairs: PosePairs, a: int, b: int, T_a: NDArray | None, T_b: NDArray | None) -> Fit:
+def _fit_of(pairs: PosePairs, a: int, b: int, T: Sequence[NDArray | None]) -> Fit:
+    T_a, T_b = T[a], T[b]
     if T_a is None or T_b is None:
         return NOTHING
     return compare(pairs.views[a], pairs.views[b], np.linalg.inv(T_b) @ T_a)
@@ -325,9 +334,8 @@ def swapped_frames(sample: Sample) -> tuple[list[int], list[Finding]]:
     """Places in the sample of frames that do not fit between their neighbours though these fit each
     other, and what is to be said of them.
     """
-    for step in (EARLY_STEP, MIN_MOTION):
-        if out := _misplaced(sample, sample.chains(step)):
-            break
+    chains = [sample.chains(step) for step in (EARLY_STEP, MIN_MOTION, SMALL_MOTION)]
+    out = sorted({i for each in chains for i in _misplaced(sample, each)})
     if not out:
         return [], []
     numbers = [sample.frames[i].index for i in out]
