@@ -1,7 +1,7 @@
 # From a bare Debian or Ubuntu machine with Python 3.11-3.13 to a result: `make demo`, `make test`.
 # `make demo PYTHON=python3.12` chooses the interpreter; `make test PYTEST_ARGS="-k surface"` hands options to pytest.
 # WORKERS processes share the tests, a file at a time, so that fixtures of a file are made once; each takes 1 to 2 GB.
-.PHONY: demo test viewers validator lint types format setup
+.PHONY: demo test fuzz soak viewers validator lint types format setup
 
 WORKERS ?= 2
 
@@ -16,6 +16,14 @@ demo:
 
 test: setup
 	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+
+# Recordings, 2,000 mutated ones of each kind; FUZZ="-k mcap" chooses.
+fuzz: setup
+	UNIFUSION_FUZZ=2000 .venv/bin/python -m pytest -n $(WORKERS) tests/fuzz/test_readers.py $(FUZZ)
+
+# Ten thousand frames of one scene: memory must not grow.
+soak: setup
+	.venv/bin/python benchmarks/soak.py
 
 # Chromium, a screen in memory and Vulkan in software, for the tests of pages and windows; without them these skip.
 viewers:

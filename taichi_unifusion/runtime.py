@@ -311,10 +311,9 @@ def _say(sentence: str) -> None:
 
 
 def import_taichi() -> Any:
-    """Taichi, or the package that takes its place where UNIFUSION_TAICHI names one, such as the fork
-    `taichi_forge`. Every file of kernels is imported after this.
-    """
+    """Taichi, or what UNIFUSION_TAICHI names, such as `taichi_forge`; kernels are imported after it."""
     os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+    os.environ.setdefault("HOME", os.path.expanduser("~"))  # without one Taichi ends the process
     name = os.environ.get("UNIFUSION_TAICHI") or "taichi"
     try:
         with _frames_read_quickly():

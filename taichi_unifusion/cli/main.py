@@ -142,7 +142,7 @@ def _run(prog: str, description: str, commands: Commands, argv: list[str]) -> in
 def _say_commands(prog: str, description: str, commands: Commands, arguments: list[str]) -> None:
     kinds = (
         Annotated[
-            options, subcommand(name, description=(inspect.getdoc(options) or "").splitlines()[0])
+            options, subcommand(name, description=(inspect.getdoc(options) or name).splitlines()[0])
         ]
         for name, (options, _) in commands.items()
     )

@@ -21,7 +21,7 @@ print(len(features), np.isfinite(features.query(points)).all())
 """
 
 
-def test_c19_a_map_of_features_is_quiet_under_debug():
+def test_c19_N6_a_map_of_features_is_quiet_under_debug():
     """N6 as well: no index is out of bounds, and wanted wrap-around is no overflow."""
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -241,3 +243,49 @@ def test_r1_rows_of_a_thousand_numbers_begin_with_little_memory():
         wide = FeatureMap("wide", 8192, FeatureSettings(precision="float32", encoder=encoder))
     assert wide.grid.capacity * wide.grid["slopes"].shape[1] * 4 <= 64 << 20
     assert peak.megabytes < 250
+
+
+def test_M10_numbers_that_are_not_finite_are_found_when_a_map_is_loaded(files, tmp_path):
+    for value in (np.nan, np.inf, 3e38):
+        path = forged(files["property"], tmp_path / "a", spoiled("latents", (2, 1, 0), value))
+        with pytest.raises(MapCorrupt, match="tensor 'latents' that are not finite, or too large"):
+            load_map(path)
+
+
+def test_M9_a_file_of_version_1_is_read_for_ever(tmp_path):
+    """Written byte by byte as version 1 has it, not by today's writer: do not renew it."""
+    keys = np.array([[0, 0, 0], [0, 0, 1]], "<i4")
+    arrays = {
+        "keys": ("I32", "int32", keys),
+        "latents": ("F32", "float32", np.full((2, 3, 1), 0.25, "<f4")),
+        "weights": ("F32", "float32", np.array([4, 2], "<f4")),
+        "masks": ("U32", "uint32", np.full((2, 2), 7, "<u4")),
+    }
+    header, entries, body = {}, {}, b""
+    for name, (code, kind, array) in arrays.items():
+        data = array.tobytes()
+        place = [len(body), len(body) + len(data)]
+        header[name] = {"dtype": code, "shape": list(array.shape), "data_offsets": place}
+        digest = hashlib.sha256(data).hexdigest()
+        entries[name] = {"shape": list(array.shape), "dtype": kind, "sha256": digest}
+        body += data
+    encoder = {"rank": 2, "anchors": 64, "length_scale": 0.4753, "seed": 0}
+    settings = {"voxel_size": 0.1, "noise": 0.1, "min_points": 1, "sampling": "cells", "margin": 1}
+    settings |= {"fusion": "mean", "prior": "mean", "blend": True, "encoder": encoder}
+    manifest = {"kind": "property", "name": "heat", "channels": 1, "voxels": 2}
+    manifest |= {"settings": settings, "format": "taichi_unifusion LIM", "format_version": 1}
+    text = json.dumps({**manifest, "tensors": entries})
+    metadata = {
+        "taichi_unifusion": text,
+        "taichi_unifusion_sha256": hashlib.sha256(text.encode()).hexdigest(),
+    }
+    head = json.dumps({"__metadata__": metadata, **header}).encode()
+    path = tmp_path / "old.safetensors"
+    path.write_bytes(len(head).to_bytes(8, "little") + head + body)
+    old = load_map(path)
+    assert (old.name, old.channels, old.voxel_size, len(old)) == ("heat", 1, 0.1, 2)
+    data = old.voxels()
+    assert np.array_equal(data.keys, keys) and (data.latents == 0.25).all()
+    assert data.weights.tolist() == [4, 2] and (data.masks == 7).all()
+    value = old.query(np.float32([[0.05, 0.05, 0.05]]))
+    assert np.isfinite(value).all() and value[0, 0] != 0
