@@ -19,7 +19,8 @@ from ..kernels.patches import Patches, Values
 from ..runtime import DeviceArray
 from ..types import Frame, Mesh, PinholeCamera, PointCloud
 from .binner import SurfelBinner, patches_of
-from .encoder import to_device
+from .distance import distances
+from .encoder import check_points, to_device
 from .local_lim import LocalLim
 from .meshing import drop_small_parts, extract_mesh
 from .regression_map import RegressionMap
@@ -155,13 +156,22 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         visibility.add_evidence(slots, votes, self.grid["evidence"])
 
     def sdf(self, points: NDArray) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Signed distance (N,) [m] at points (N, 3) world [m], positive in front of the surface,
-        and where it is known (N,).
+        """Signed distance (N,) [m] to the surface at points (N, 3) world [m], positive in front of
+        it, and where it is known (N,): within about a voxel of the surface, to some per cent.
+
+        Elsewhere the value has the field's sign, where a voxel is, and says no distance; 0 where there
+        is none.
         """
         self.flush()
         runtime.check_alive(self.grid.runtime)
-        values, valid = self.decoder.decode(self.grid, points, blend=True, reach=0)
-        return values[:, 0] * np.float32(self.voxel_size), valid
+        scale = np.float32(self.voxel_size)
+
+        def field(x: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+            values, valid = self.decoder.decode(self.grid, x * scale, blend=True, reach=0)
+            return values[:, 0], valid
+
+        values, known = distances(field, check_points(points) / scale)
+        return values * scale, known
 
     def extract_mesh(
         self,
