@@ -17,11 +17,14 @@ import yaml
 from .errors import (
     ConfigError,
     InputError,
+    check_box,
     check_choice,
     check_range,
+    check_types,
     convert,
     did_you_mean,
     shortened,
+    strict,
 )
 from .files.strict_yaml import read_yaml
 from .maps.detail import ROOM, Detail, choose_voxel_size, sight_of
@@ -44,6 +47,7 @@ S = TypeVar("S", bound=MapSettings)
 MAX_THREADS = 4096  # of a CPU
 
 
+@strict
 @dataclass(frozen=True)
 class MeshSettings:
     """The mesh that is extracted at the end."""
@@ -57,16 +61,27 @@ class MeshSettings:
     """Connected parts of less than this area, in square metres, are left out: mostly stray
     readings. 0 keeps all.
     """
+    bounds: tuple[float, float, float, float, float, float] | None = None
+    """Only what lies in this box of the world: x, y, z of its lowest corner, then of its highest, in
+    metres.
+    """
+    extract: bool = True
+    """Extract a mesh at the end; without one, `unifusion mesh` makes it later from the maps.
+    """
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_range("resolution", self.resolution, 1, MAX_RESOLUTION, "cells a voxel")
         check_range("min_area", self.min_area, 0, 1e6, "square metres")
         if not self.formats or len(set(self.formats)) < len(self.formats):
             raise InputError(
                 f"formats: must name one or more of ply, glb and obj, each once, got {self.formats}"
             )
+        if self.bounds is not None:
+            check_box(self.bounds[:3], self.bounds[3:])
 
 
+@strict
 @dataclass(frozen=True)
 class Config:
     """Every setting of a reconstruction."""
@@ -131,6 +146,7 @@ class Config:
         )
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_choice("detail", self.detail, get_args(Detail))
         check_voxel_size(self.voxel_size)
         check_range("threads", self.threads, 0, MAX_THREADS)

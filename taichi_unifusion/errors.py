@@ -8,13 +8,17 @@ needs.
 from __future__ import annotations
 
 import difflib
+import functools
+import numbers
 import re
 import reprlib
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, SupportsFloat, Union, get_args, get_origin
+from typing import Any, Literal, SupportsFloat, TypeVar, Union, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
 
 _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 _LARGEST_INTEGER = 2**63  # what NumPy and files can hold
@@ -122,13 +126,92 @@ def check_range(name: str, value: float, low: float, high: float, unit: str = ""
         )
 
 
+def check_box(low: Sequence[float], high: Sequence[float]) -> None:
+    """Raise InputError unless every coordinate of one corner of a box is below that of the other."""
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise InputError(
+            "bounds: every coordinate of the first corner must be below that of the second, got "
+            f"{' '.join(f'{x:g}' for x in low)} and {' '.join(f'{x:g}' for x in high)}"
+        )
+
+
+def strict(kind: type[T]) -> type[T]:
+    """A dataclass of settings whose constructor raises InputError for an unknown keyword and for a value
+    that is not of its field's type.
+    """
+    construct = kind.__init__
+
+    @functools.wraps(construct)
+    def __init__(self: Any, *args: Any, **keywords: Any) -> None:
+        check_keywords(kind.__name__, keywords, kind.__dataclass_fields__)  # pyright: ignore[reportAttributeAccessIssue]
+        construct(self, *args, **keywords)
+
+    kind.__init__ = __init__
+    return kind
+
+
+def check_keywords(what: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Raise InputError, with the right ones, for a keyword that `what` does not have."""
+    for name in given:
+        if name not in known:
+            near = did_you_mean(name, known)
+            raise InputError(f"{what}: there is no '{name[:80]}'{near}; it has {', '.join(known)}")
+
+
+def check_types(settings: Any) -> None:
+    """Raise InputError unless every field of a dataclass holds what its annotation says; NumPy's
+    numbers are numbers.
+    """
+    for name, wanted in _field_types(type(settings)).items():
+        value = getattr(settings, name)
+        if not _is_of(value, wanted):
+            raise InputError(f"{name}: expected {_kind_words(wanted)}, got {shortened(value)}")
+
+
+@functools.cache
+def _field_types(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    return {name: hints[name] for name in kind.__dataclass_fields__}  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _is_of(value: object, wanted: Any) -> bool:
+    origin, options = get_origin(wanted), get_args(wanted)
+    if origin in (Union, UnionType):
+        return any(_is_of(value, each) for each in options)
+    if origin is Literal:
+        return isinstance(value, str | int)  # `check_choice` names the choices
+    if origin is tuple:
+        every = (
+            options[:1] * len(value) if isinstance(value, tuple) and options[-1] is ... else options
+        )
+        return (
+            isinstance(value, tuple) and len(value) == len(every) and all(map(_is_of, value, every))
+        )
+    if wanted in (float, int):
+        number = numbers.Real if wanted is float else numbers.Integral
+        return isinstance(value, number) and not isinstance(value, bool)
+    return wanted is Any or isinstance(value, wanted)
+
+
+def _kind_words(wanted: Any) -> str:
+    """A type in words."""
+    origin, options = get_origin(wanted), get_args(wanted)
+    if origin in (Union, UnionType):
+        return " or ".join(_kind_words(each) for each in options)
+    if origin is tuple:
+        return "a tuple, as ('a', 'b')" if options[0] is str else "a tuple"
+    if wanted in _KINDS:
+        return _KINDS[wanted]
+    return "nothing" if wanted is NoneType else f"{getattr(wanted, '__name__', wanted)}(...)"
+
+
 def did_you_mean(word: object, known: Iterable[str], at_most: int = 1) -> str:
-    """The end of a sentence about an unknown word, ", did you mean 'x' or 'y'?", or nothing if
-    none of the known is like it.
+    """What follows an unknown word in a sentence, " (did you mean 'x' or 'y'?)", or nothing if none of
+    the known is like it.
     """
     near = difflib.get_close_matches(str(word)[:80].lower(), list(known), n=at_most)
     names = " or ".join(f"'{name}'" for name in near)
-    return f", did you mean {names}?" if near else ""
+    return f" (did you mean {names}?)" if near else ""
 
 
 def convert(value: object, wanted: Any, name: str) -> Any:

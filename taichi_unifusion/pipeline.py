@@ -6,18 +6,18 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from . import runtime
 from .config import Config
-from .datasets.loading import load_ahead
+from .datasets.loading import first_frames, load_ahead
 from .errors import FrameError, InputError, as_known
 from .kernels.patches import Patches
 from .language.source import FeatureSource
@@ -47,8 +47,6 @@ from .run_log import (
 from .types import Frame, Mesh, PinholeCamera
 
 logger = logging.getLogger(__name__)
-
-SETTLE_FRAMES, SETTLE_STEP = 5, 5  # of a sequence, that voxel sizes are chosen by
 
 
 class Source(Protocol):
@@ -101,6 +99,10 @@ class Pipeline:
         tiles: str | Path | None = None,
         maps: Mapping[str, BaseMap] | None = None,
     ) -> None:
+        if config is not None and not isinstance(config, Config):
+            raise InputError(
+                f"Pipeline: expected Config(...), got {type(config).__name__}; load_config reads a file"
+            )
         self.config = config = config or Config()
         self.synchronize = synchronize
         made = [make_property(text, config.property_map) for text in config.properties]
@@ -179,6 +181,10 @@ class Pipeline:
         assert isinstance(surface, SurfaceMap)
         return surface
 
+    def __repr__(self) -> str:
+        maps = ", ".join(map(repr, self._maps.values()))
+        return f"<Pipeline of {maps or 'maps that the first frame will size'}>"
+
     @property
     def properties(self) -> dict[str, PropertyMap]:
         """The maps whose values a mesh carries, by name."""
@@ -191,6 +197,8 @@ class Pipeline:
         Raises FrameError where the frame has no pose or no usable depth, OutOfRange where it lies
         beyond a map's index range, CapacityError where a map would grow beyond safe memory.
         """
+        if not isinstance(frame, Frame):
+            raise InputError(f"Pipeline.step: expected a Frame, got {type(frame).__name__}")
         clock, live = StageClock(self.synchronize), runtime.current()
         T_world_camera = frame.require_pose()
         if not self.settle([frame]):
@@ -341,6 +349,8 @@ class Pipeline:
         except Exception as error:  # noqa: BLE001
             failure = failure or self._ended_by(error)
             self.fusion.give_up()
+        if self._maps:
+            log.check_sides(self.surface.sides, self.surface.voxel_size)
         return log.result(interrupted, failure)
 
     def _ended_by(self, error: Exception) -> Exception:
@@ -353,11 +363,12 @@ class Pipeline:
         self,
         resolution: int | None = None,
         *,
+        bounds: ArrayLike | None = None,
         blocks: NDArray[np.int32] | None = None,
         flush: bool = True,
     ) -> Mesh:
-        """The mesh of all that was fused so far, coloured; `resolution` overrides the
-        configuration's.
+        """The mesh of all that was fused so far, coloured; `resolution` and `bounds`, lowest and highest
+        corner of a box [m], override the configuration's.
 
         With `blocks` (M, 3), what lies in these, small parts too; without `flush`, frames that wait to
         be fused are left out: see `SurfaceMap.extract_mesh`.
@@ -371,20 +382,10 @@ class Pipeline:
             self.properties,
             resolution,
             settings.min_area if blocks is None else 0.0,
+            bounds=settings.bounds if bounds is None and blocks is None else bounds,
             blocks=blocks,
             flush=flush,
         )
-
-
-def first_frames(sequence: Sequence[Frame], stop: Callable[[], bool]) -> Iterator[Frame]:
-    """Some of the first frames of a sequence, those that can be loaded."""
-    for i in range(0, min(len(sequence), SETTLE_STEP * SETTLE_FRAMES), SETTLE_STEP):
-        if stop():
-            return
-        try:
-            yield sequence[i]
-        except Exception:  # noqa: BLE001 - `run` says so when it comes to it
-            continue
 
 
 def _by_name(sources: Iterable[Source]) -> dict[str, Source]:
@@ -404,13 +405,14 @@ def extract_mesh(
     resolution: int,
     min_area: float = 0.0,
     *,
+    bounds: ArrayLike | None = None,
     blocks: NDArray[np.int32] | None = None,
     flush: bool = True,
 ) -> Mesh:
-    """The surface as a mesh that carries every property that has data; `blocks` and `flush` as in
-    `SurfaceMap.extract_mesh`.
+    """The surface as a mesh that carries every property that has data; `bounds`, `blocks` and
+    `flush` as in `SurfaceMap.extract_mesh`.
     """
-    mesh = surface.extract_mesh(resolution, min_area, blocks=blocks, flush=flush)
+    mesh = surface.extract_mesh(resolution, min_area, bounds=bounds, blocks=blocks, flush=flush)
     for name, source in properties.items():
         if len(source.grid) and len(mesh.vertices):
             mesh = mesh.with_attribute(name, source.query(mesh.vertices, flush=flush))

@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import runtime
-from .errors import InputError
+from .errors import InputError, check_types, strict
 from .runtime import DeviceArray
 from .types import Frame, ImageView, PointCloud
 
 if TYPE_CHECKING:
     from .kernels.patches import Patches, Target, Targets, Values
 
+NO_METRES = 100.0  # nearest reading of an image that cannot be in metres
 FARTHEST = 1e4  # [m] readings beyond it are dropped
 
 
+@strict
 @dataclass(frozen=True)
 class PreprocessSettings:
     """What makes a pixel a point."""
@@ -44,6 +46,7 @@ class PreprocessSettings:
     half the finest voxel at most. 0: every pixel is a point."""
 
     def __post_init__(self) -> None:
+        check_types(self)
         if not 0 < self.depth_min < self.depth_max:
             raise InputError(
                 f"preprocess: need 0 < depth_min < depth_max, got {self.depth_min} and {self.depth_max}"
@@ -67,8 +70,11 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
 
     A frame without a usable pixel gives an empty cloud.
     """
-    runtime.current()
+    if not isinstance(frame, Frame):
+        raise InputError(f"preprocess: expected a Frame, got {type(frame).__name__}")
     settings = settings or PreprocessSettings()
+    check_metres(frame, settings)
+    runtime.current()
     views = np.empty((1, *frame.depth.shape), np.float32)
     patches = find_patches(frame, settings, invert_depth(frame, settings, views, 0), np.eye(4))
     found = patches.found.to_numpy()
@@ -87,6 +93,16 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
         frame.features,
         _take(patches.counts, rows),
     )
+
+
+def check_metres(frame: Frame, settings: PreprocessSettings) -> None:
+    """Raise InputError for a depth image whose readings are so large that they are no metres."""
+    readings = frame.depth[np.isfinite(frame.depth) & (frame.depth > 0)]
+    if len(readings) and readings.min() > max(NO_METRES, settings.depth_max):
+        raise InputError(
+            f"{frame.label}: depth must be in metres, but its median is {np.median(readings):g}: "
+            "divide millimetres by 1000"
+        )
 
 
 def _take(array: DeviceArray, rows: NDArray[np.int32]) -> NDArray:

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import FrameError, InputError, PoseError, SizeMismatch
+from .errors import FrameError, InputError, PoseError, SizeMismatch, shortened
 from .geometry.camera import PinholeCamera
 from .geometry.triangles import used_vertices
 
@@ -103,6 +103,11 @@ class Frame:
 
     def __post_init__(self) -> None:
         at = self.label
+        for name, image in (("depth", self.depth), ("color", self.color)):
+            if image is not None and not isinstance(image, np.ndarray):
+                raise FrameError(f"{at}: {name} must be a NumPy array, got {type(image).__name__}")
+        if not isinstance(self.camera, PinholeCamera):
+            raise FrameError(f"{at}: camera must be a PinholeCamera, got {shortened(self.camera)}")
         if self.depth.ndim != 2 or self.depth.dtype != np.float32:
             raise FrameError(
                 f"{at}: depth must be (H, W) float32 in metres, got {self.depth.shape} {self.depth.dtype}"
@@ -128,6 +133,13 @@ class Frame:
             object.__setattr__(
                 self, "T_world_camera", check_rigid(self.T_world_camera, f"{at}: T_world_camera")
             )
+
+    def __repr__(self) -> str:
+        width, height = self.camera.size
+        parts = ["color" if self.color is not None else "no color", *self.images, *self.features]
+        if self.T_world_camera is None:
+            parts.append("no pose")
+        return f"<Frame {self.index} {self.name}: {width}x{height}, {', '.join(parts)}>"
 
     @property
     def label(self) -> str:
@@ -220,6 +232,10 @@ class PointCloud:
         ):
             if array is None:
                 continue
+            if not isinstance(array, np.ndarray):
+                raise InputError(
+                    f"point cloud: {name} must be a NumPy array, got {type(array).__name__}"
+                )
             if (
                 array.ndim != 2
                 or (columns and array.shape[1] != columns)
@@ -274,6 +290,11 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __repr__(self) -> str:
+        normals = ["normals"] * (self.normals is not None)
+        parts = [*normals, *self.attributes, *self.features]
+        return f"<PointCloud: {len(self):,} points{' with ' if parts else ''}{', '.join(parts)}>"
 
     def take(self, rows: NDArray) -> PointCloud:
         """The points at `rows`, indices (M,) or a mask (N,), with what belongs to them."""
@@ -333,6 +354,12 @@ class Mesh:
                     f"mesh: {len(self.vertices)} vertices but {len(array)} rows of {name}"
                 )
 
+    def __repr__(self) -> str:
+        normals = ["normals"] * (self.normals is not None)
+        parts = [*normals, *self.attributes]
+        size = f"{len(self.vertices):,} vertices, {len(self.faces):,} triangles"
+        return f"<Mesh: {size}{' with ' if parts else ''}{', '.join(parts)}>"
+
     def with_attribute(self, name: str, values: NDArray) -> Mesh:
         """A copy with `values`, (V,) or (V, c), at the vertices under `name`."""
         values = np.ascontiguousarray(values, dtype=np.float32)
@@ -388,3 +415,7 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    def __repr__(self) -> str:
+        span = f", {self.timestamps[0]:g} to {self.timestamps[-1]:g} s" if len(self) else ""
+        return f"<Trajectory: {len(self)} poses{span}>"

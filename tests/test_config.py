@@ -80,7 +80,7 @@ def test_a_number_with_an_exponent_is_a_number(tmp_path):
         ("surface: {min_points: 2.5}", ["surface.min_points: expected a whole number, got 2.5"]),
         ("surface: {min_points: true}", ["surface.min_points: expected a whole number, got True"]),
         ("color: {blend: 1}", ["color.blend: expected true or false, got 1"]),
-        ("device: cud", ["device: 'cud' is unknown, did you mean 'cuda'?", "auto, cuda, cpu"]),
+        ("device: cud", ["device: 'cud' is unknown (did you mean 'cuda'?)", "auto, cuda, cpu"]),
         ("mesh: {formats: ply}", ["mesh.formats: expected a list, got 'ply'"]),
         ("mesh: {formats: [ply, stl]}", ["mesh.formats[1]: 'stl' is unknown", "ply, glb, obj"]),
         ("surface: {voxel_size: -1}", ["in surface: voxel_size", "-1"]),

@@ -55,7 +55,7 @@ def test_what_converts(value, wanted, converted):
         (5, str, "x: expected text, got 5"),
         ("", Path, "x: expected a file's name, got ''"),
         (None, float, "x: expected a number, got None"),
-        ("colour", Literal["depth", "color"], "x: 'colour' is unknown, did you mean 'color'"),
+        ("colour", Literal["depth", "color"], "x: 'colour' is unknown .did you mean 'color'"),
         ("64", tuple[int, int], "x: expected WIDTHxHEIGHT, got '64'"),
         ("1/a", tuple[float, ...], "x: expected numbers with / between them, got '1/a'"),
         ("ply", tuple[Literal["ply"], ...], "x: expected a list, got 'ply'"),
@@ -71,11 +71,11 @@ def test_what_does_not_convert_is_said(value, wanted, told):
 
 def test_suggestions():
     known = ("surface", "color", "depth")
-    assert did_you_mean("Surfce", known) == ", did you mean 'surface'?"
+    assert did_you_mean("Surfce", known) == " (did you mean 'surface'?)"
     assert did_you_mean("xyz", known) == ""
-    assert did_you_mean("colr", (*known, "colors"), at_most=2).endswith("'color' or 'colors'?")
+    assert did_you_mean("colr", (*known, "colors"), at_most=2).endswith("'color' or 'colors'?)")
     check_choice("map", "color", known)
     with pytest.raises(InputError, match="map: 'x' is unknown, choose one of surface, color, dep"):
         check_choice("map", "x", known)
-    with pytest.raises(InputError, match="did you mean 'depth'\\?; choose one of surface"):
+    with pytest.raises(InputError, match="did you mean 'depth'\\?\\); choose one of surface"):
         check_choice("map", "dept", known)

@@ -25,7 +25,12 @@ from .options import Device
 
 NO_DEFAULT = "(none by default)"
 # names that people try first -> the settings that they are
-SHORT = {"--depth-max": "--preprocess.depth-max", "--depth-min": "--preprocess.depth-min"}
+SHORT = {
+    "--depth-max": "--preprocess.depth-max",
+    "--depth-min": "--preprocess.depth-min",
+    "--bounds": "--mesh.bounds",
+    "--no-mesh": "--mesh.no-extract",
+}
 
 
 def with_long_names(arguments: Sequence[str]) -> list[str]:

@@ -41,6 +41,11 @@ class ExtractMesh:
     """
     up: UpOption = None
     """Another up for the pictures and the record: an axis as z or -y, or three numbers."""
+    bounds: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="(default: everything)"),
+    ] = None
+    """Only what lies in this box of the world: its lowest and its highest corner, in metres."""
     device: Device = "auto"
     """Where to compute."""
 
@@ -76,7 +81,9 @@ def extract_mesh(options: ExtractMesh) -> int:
         for name, path in maps.items()
         if read_description(path).kind == PropertyMap.kind  # others give vertices no value
     }
-    mesh = pipeline.extract_mesh(surface, properties, options.resolution, options.min_area)
+    mesh = pipeline.extract_mesh(
+        surface, properties, options.resolution, options.min_area, bounds=options.bounds
+    )
     meshes = dict.fromkeys(files, mesh)
     if not options.out:
         from ..results.property_files import property_meshes

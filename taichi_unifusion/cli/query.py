@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,8 +19,12 @@ from .terminal import report
 from .texts import make_encoder, templates_of
 
 if TYPE_CHECKING:
+    from ..errors import InputError
     from ..language.questions import Answer
+    from ..networks.encoders import TextEncoder
+    from ..results.folder_writer import FolderWriter
     from ..results.run_folder import RunFolder
+    from ..results.understood import Understood
 
 logger = logging.getLogger(__name__)
 
@@ -29,8 +35,8 @@ class Query:
 
     Example: unifusion query results/flat "sofa" "something to sit on"
 
-    Each text gives query-TEXT.ply, coloured by relevance, query-TEXT.png, and ranked regions in
-    query.json.
+    Each text that is found gives query-TEXT.ply, coloured by relevance, query-TEXT.png, and ranked
+    regions in query.json; several together also query.ply with a column each.
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
@@ -75,47 +81,101 @@ def query(options: Query) -> int:
     folder = RunFolder(check_writable(options.dir))
     writer = FolderWriter(folder)
     encoder = make_encoder(options.encoder, understood.features.settings.source, options.dir)
+    texts, unknown = split_known(encoder, options.texts)
     answers = ask(
         understood.features,
         understood.mesh,
         encoder,
-        options.texts,
+        texts,
         negatives=options.negative,
         threshold=options.threshold,
         min_area=options.min_area,
         templates=templates_of(options.encoder),
     )
-    from ..files.meshes import write_mesh
-    from ..language.pictures import cameras_that_see, heat_mesh
-    from ..rendering.preview import render_preview
-
-    listed = []
-    for answer in answers:
-        mesh, name = heat_mesh(understood.mesh, answer.relevance), file_name(answer.text)
-        file, picture = folder.answer_mesh(name), folder.answer_picture(name)
-        writer.write(file, lambda path, mesh=mesh: write_mesh(path, mesh))
-        cameras = (
-            cameras_that_see(understood.trajectory, answer.regions[0].centroid)
-            if answer.found
-            else understood.trajectory
-        )
-        writer.write(
-            picture,
-            lambda path, mesh=mesh, cameras=cameras: render_preview(
-                mesh, path, trajectory=cameras, up=understood.outlook.up.direction
-            ),
-        )
-        listed.append({"mesh": file.name, "picture": picture.name, **describe(answer, options.top)})
+    listed = [_write_answer(writer, understood, answer, options) for answer in answers]
+    listed += [{"text": text, "found": False, "reason": str(why)} for text, why in unknown.items()]
+    writer.failures.extend(unknown.values())
+    _write_columns(writer, understood, answers)
     text = json.dumps(listed, indent=2)
     writer.write(folder.answers, lambda path: write_text(path, text + "\n"))
     if options.encoder.json:
         print(text)
-    else:
-        print("\n\n".join([*map(_table, listed), _origin(folder)]))
+    else:  # errors say what is unknown
+        said = [entry for entry in listed if entry["text"] not in unknown]
+        print("\n\n".join([*map(_table, said), _origin(folder)]))
     writer.attempt(
         f"{folder.record}: could not be updated", lambda: add_answers(folder, writer.written)
     )
     return report(writer.failures)
+
+
+def split_known(
+    encoder: TextEncoder, texts: Sequence[str]
+) -> tuple[list[str], dict[str, InputError]]:
+    """The texts that an encoder has vectors for, and why it has none for the others; raises the first
+    of these where there is no text left.
+    """
+    from ..errors import InputError
+
+    known, unknown = [], {}
+    for text in dict.fromkeys(texts):
+        try:
+            encoder.text_features([text])
+            known.append(text)
+        except InputError as error:
+            unknown[text] = error
+    if not known:
+        raise next(iter(unknown.values()))
+    return known, unknown
+
+
+def _write_answer(
+    writer: FolderWriter, understood: Understood, answer: Answer, options: Query
+) -> dict[str, Any]:
+    """Mesh and picture of what was found, and what the list of answers says of it. What was not found
+    has no files, and those of an earlier question go.
+    """
+    from ..files.images import write_png
+    from ..files.meshes import write_mesh
+    from ..language.answers import answer_picture, file_name, why_not_here
+    from ..language.pictures import cameras_that_see, heat_mesh
+    from ..rendering.preview import choose_views
+
+    name, files = file_name(answer.text), {}
+    mesh_file, picture = writer.folder.answer_mesh(name), writer.folder.answer_picture(name)
+    described = describe(answer, options.top)
+    if not answer.found:
+        writer.remove(mesh_file)
+        writer.remove(picture)
+        why = why_not_here(answer, understood.mesh, options.threshold, options.min_area)
+        return {**described, "reason": why}
+    mesh = heat_mesh(understood.mesh, answer.relevance)
+    cameras = cameras_that_see(understood.trajectory, answer.regions[0].centroid)
+    views = choose_views(mesh, trajectory=cameras, up=understood.outlook.up.direction)
+    writer.write(mesh_file, lambda path: write_mesh(path, mesh))
+    writer.write(
+        picture,
+        lambda path: write_png(path, answer_picture(mesh, answer.text, answer.regions, views)),
+    )
+    files = {"mesh": mesh_file.name, "picture": picture.name}
+    return {**files, **described}
+
+
+def _write_columns(writer: FolderWriter, understood: Understood, answers: Sequence[Answer]) -> None:
+    """One mesh with the relevance of every text that was found as a column, where there are several."""
+    from ..files.meshes import write_mesh
+    from ..language.answers import file_name
+
+    found = [answer for answer in answers if answer.found]
+    file = writer.folder.answer_columns
+    if len(found) < 2:
+        writer.remove(file)
+        return
+    mesh = understood.mesh
+    for answer in found:
+        column = re.sub(r"[^0-9A-Za-z_]", "_", file_name(answer.text))
+        mesh = mesh.with_attribute(f"relevance_{column}", answer.relevance)
+    writer.write(file, lambda path: write_mesh(path, mesh))
 
 
 def describe(answer: Answer, top: int) -> dict[str, Any]:
@@ -137,12 +197,6 @@ def describe(answer: Answer, top: int) -> dict[str, Any]:
     }
 
 
-def file_name(text: str) -> str:
-    """A text as a part of a file's name."""
-    kept = "".join(letter if letter.isalnum() else "-" for letter in text.lower())
-    return "-".join(part for part in kept.split("-") if part)[:60] or "text"
-
-
 def _origin(folder: RunFolder) -> str:
     """Where the coordinates of tables begin."""
     from ..errors import FileError
@@ -157,10 +211,7 @@ def _origin(folder: RunFolder) -> str:
 
 def _table(entry: dict[str, Any]) -> str:
     if not entry["found"]:
-        return (
-            f"{entry['text']}: not here; its relevance is {entry['highest_relevance']:.2f} at most, "
-            "and something else is nearer everywhere"
-        )
+        return f"{entry['text']}: not here; {entry['reason']}"
     rows = [["rank", "score", "area m2", "centre x y z m", "size m"]]
     for i, region in enumerate(entry["regions"], start=1):
         low, high = region["box"]

@@ -11,6 +11,8 @@ from ..types import Frame
 from .dataset import DatasetView
 from .live import Arriving
 
+FIRST, STRIDE = 5, 5  # of the first frames: how many tell the scale, and how far apart they are
+
 
 def load_ahead(sequence: Sequence[Frame], start: int = 0) -> Iterator[Callable[[], Frame]]:
     """Yield one function for each frame from `start`, in order: it returns the frame, or raises what
@@ -31,6 +33,17 @@ def load_ahead(sequence: Sequence[Frame], start: int = 0) -> Iterator[Callable[[
                 ahead.append(pool.submit(sequence.__getitem__, i))
             if i > start:
                 yield ahead.popleft().result
+
+
+def first_frames(sequence: Sequence[Frame], stop: Callable[[], bool]) -> Iterator[Frame]:
+    """Some of the first frames of a sequence, those that can be loaded, until `stop` says so."""
+    for i in range(0, min(len(sequence), FIRST * STRIDE), STRIDE):
+        if stop():
+            return
+        try:
+            yield sequence[i]
+        except Exception:  # noqa: BLE001 - whoever loads the frame in its turn hears of it
+            continue
 
 
 def recording_of(sequence: Sequence[Frame]) -> Sequence[Frame]:

@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import csv
+import difflib
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+import unicodedata
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, InputError, did_you_mean
+from ..errors import FileError, InputError
 from ..files.arrays import read_archive, read_array
 from ..files.atomic import read_bytes
 from ..files.json_text import parse_json
 from ..networks.encoders import unit_length
 
+SLIP, SURE_SLIP = 0.75, 0.85  # likeness of words with letters in another order, and of other words
+
 
 @dataclass(frozen=True)
 class TextEmbeddings:
-    """Names and their vectors; a name is found however it is capitalised, with spaces or
-    underscores, without its (remark).
+    """Names and their vectors; a name is found however it is capitalised and composed, with spaces or
+    underscores, without its (remark), or by a synonym that its file lists.
     """
 
     name: str
     names: tuple[str, ...]
     vectors: NDArray[np.float32]  # (n, c) unit length
+    synonyms: Mapping[str, int] = field(default_factory=dict)  # other name -> row
 
     def text_features(self, texts: Sequence[str]) -> NDArray[np.float32]:
         """(m, c) of the texts; raises InputError, with the nearest names, for one that the file
@@ -35,21 +40,37 @@ class TextEmbeddings:
         return self.vectors[[self._row(text) for text in texts]]
 
     def _row(self, text: str) -> int:
+        row = self._find(text)
+        if row is not None:
+            return row
+        near = self._spelled_like(_plain(text))
+        raise InputError(
+            f"{self.name}: has no vector for '{text}'{near}; it holds {len(self.names)} names, and "
+            "with a text encoder any text can be asked"
+        )
+
+    def _find(self, text: str) -> int | None:
         for plain in (_plain, _bare):  # 'runner (carpet)' before 'runner'
             rows = {plain(name): i for i, name in reversed(list(enumerate(self.names)))}
             if plain(text) in rows:
                 return rows[plain(text)]
-        near = did_you_mean(_plain(text), [_plain(name) for name in self.names], at_most=3)
-        raise InputError(
-            f"{self.name}: has no vector for '{text}'{near or '.'} It holds {len(self.names)} names; "
-            "with a text encoder any text can be asked"
-        )
+        return {_plain(name): row for name, row in self.synonyms.items()}.get(_plain(text))
+
+    def _spelled_like(self, word: str) -> str:
+        """What may have been meant: names that differ by a slip of the fingers, not other words."""
+        names = {_bare(name) for name in self.names} | {_plain(name) for name in self.synonyms}
+        near = [
+            name
+            for name in difflib.get_close_matches(word, sorted(names), n=6, cutoff=SLIP)
+            if sorted(name) == sorted(word)
+            or difflib.SequenceMatcher(None, word, name).ratio() >= SURE_SLIP
+        ]
+        words = " or ".join(f"'{name}'" for name in near[:2])
+        return f" (did you mean {words}?)" if words else ""
 
     def has(self, text: str) -> bool:
         """Whether there is a vector for the text."""
-        return _plain(text) in {_plain(name) for name in self.names} | {
-            _bare(name) for name in self.names
-        }
+        return self._find(text) is not None
 
     @property
     def anything(self) -> NDArray[np.float32]:
@@ -72,14 +93,14 @@ def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> Tex
             raise InputError(
                 f"{path}: 'names' must be a list of texts, got {named.shape} {named.dtype}"
             )
-        listed = [str(name) for name in named]
+        listed, synonyms = [str(name) for name in named], {}
     else:
         vectors = read_array(path)
         beside = [path.with_suffix(suffix) for suffix in (".txt", ".json", ".csv")]
         found = Path(names) if names else next((other for other in beside if other.exists()), None)
         if found is None:
             raise FileError(f"{path}: give the file of its names, with --names")
-        listed = _read_names(found)
+        listed, synonyms = _read_names(found)
     if (
         vectors.ndim != 2
         or vectors.dtype.kind != "f"
@@ -93,30 +114,38 @@ def read_embeddings(file: str | Path, *, names: str | Path | None = None) -> Tex
     if not np.isfinite(vectors).all():
         bad = listed[int(np.argmin(np.isfinite(vectors).all(axis=1)))]
         raise InputError(f"{path}: the vector of '{bad}' is zero or not finite")
-    return TextEmbeddings(str(path), tuple(listed), vectors)
+    return TextEmbeddings(str(path), tuple(listed), vectors, synonyms)
 
 
-def _read_names(path: Path) -> list[str]:
+def _read_names(path: Path) -> tuple[list[str], dict[str, int]]:
+    """Names in order, and synonyms of them with their row; a name that two rows have as a synonym is
+    the first's.
+    """
     try:
         text = read_bytes(path).decode("utf-8-sig")
         if path.suffix == ".json":
-            return [
-                entry["name"] if isinstance(entry, dict) else str(entry)
-                for entry in parse_json(text)
-            ]
+            entries = parse_json(text)
+            names = [each["name"] if isinstance(each, dict) else str(each) for each in entries]
+            synonyms = {
+                str(word): row
+                for row, each in reversed(list(enumerate(entries)))
+                if isinstance(each, dict) and isinstance(each.get("synonyms"), list)
+                for word in each["synonyms"]
+            }
+            return names, synonyms
         if path.suffix == ".csv":
-            return [row[-1] for row in csv.reader(text.splitlines()) if row]
-        return [
-            line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")
-        ]
-    except (ValueError, KeyError, TypeError, csv.Error) as error:
+            return [row[-1] for row in csv.reader(text.splitlines()) if row], {}
+        lines = [line.strip() for line in text.splitlines()]
+        return [line for line in lines if line and not line.startswith("#")], {}
+    except (ValueError, KeyError, TypeError) as error:
         raise FileError(
             f"{path}: not a list of names ({type(error).__name__}: {str(error)[:120]})"
         ) from None
 
 
 def _plain(name: str) -> str:
-    return " ".join(re.sub(r"[_\s]+", " ", name).lower().split())
+    composed = unicodedata.normalize("NFC", name)
+    return " ".join(re.sub(r"[_\s]+", " ", composed).lower().split())
 
 
 def _bare(name: str) -> str:

@@ -13,6 +13,7 @@ from ..geometry.triangles import vertex_areas
 from ..types import Mesh
 
 THRESHOLD = 0.5  # relevance from which a vertex belongs to a region: the query beats all rivals
+JOIN = 0.05  # [m] between parts of one region
 MIN_AREA = 0.01  # [m^2] of a region; smaller ones are noise
 
 
@@ -28,10 +29,16 @@ class Region:
 
 
 def find_regions(
-    mesh: Mesh, relevance: NDArray, *, threshold: float = THRESHOLD, min_area: float = MIN_AREA
+    mesh: Mesh,
+    relevance: NDArray,
+    *,
+    threshold: float = THRESHOLD,
+    min_area: float = MIN_AREA,
+    join: float = JOIN,
 ) -> list[Region]:
     """Connected parts of a mesh where `relevance` (V,) reaches the threshold, those with the largest
-    integral of relevance above it first.
+    integral of relevance above it first. Parts that come as near as `join` [m] are one: a sofa that is
+    seen in two pieces.
 
     Raises InputError for a relevance of another mesh or a threshold outside 0..1.
     """
@@ -53,6 +60,8 @@ def find_regions(
         if len(edges)
         else np.arange(count)
     )
+    if join > 0:
+        part = join_near(mesh.vertices, part, np.flatnonzero(inside), join)
     areas = vertex_areas(mesh.vertices, mesh.faces)
     vertices = np.flatnonzero(inside)
     order = vertices[np.argsort(part[vertices], kind="stable")]
@@ -63,6 +72,30 @@ def find_regions(
         if areas[group].sum() >= max(min_area, 1e-12)
     ]
     return sorted(regions, key=lambda region: -(region.score - threshold) * region.area)
+
+
+def join_near(
+    vertices: NDArray, part: NDArray, chosen: NDArray, distance: float
+) -> NDArray[np.int64]:
+    """The part (V,) of every vertex, where those of the chosen (N,) vertices within about `distance` [m]
+    of another part are put together; points are rounded to half of it.
+    """
+    joined = np.asarray(part, np.int64).copy()
+    if not len(chosen):
+        return joined
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    spots = np.floor(vertices[chosen] / (distance / 2)).astype(np.int64)
+    rows = np.unique(np.column_stack([spots, joined[chosen]]), axis=0)
+    numbers, of = np.unique(rows[:, 3], return_inverse=True)
+    pairs = of[cKDTree(rows[:, :3]).query_pairs(2.0, output_type="ndarray")].reshape(-1, 2)
+    pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+    links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(numbers), len(numbers)))
+    _, group = connected_components(links, directed=False)
+    joined[chosen] = group[np.searchsorted(numbers, joined[chosen])]
+    return joined
 
 
 def _region(mesh: Mesh, relevance: NDArray, areas: NDArray, group: NDArray) -> Region:

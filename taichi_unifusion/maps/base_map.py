@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, NoReturn, Protocol, Self, TypeVar
 
-from ..errors import InputError, MapCorrupt
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, MapCorrupt, shortened
 from ..files.maps import write_map
 from ..types import Frame, PointCloud
 from .settings import MapSettings, check_name
@@ -86,6 +89,17 @@ class BaseMap(ABC, Generic[S]):
         """Bytes of the voxels and their index."""
         self.flush()
         return self.grid.memory_bytes
+
+    @property
+    def bounds(self) -> NDArray[np.float64] | None:
+        """The lowest and the highest corner (2, 3) world [m] of all voxels; None where there is none."""
+        self.flush()
+        keys = self.grid.voxel_keys()
+        return self.voxel_size * np.array([keys.min(0), keys.max(0) + 1]) if len(keys) else None
+
+    def __repr__(self) -> str:
+        centimetres = f"{100 * self.voxel_size:g} cm"
+        return f"<{type(self).__name__} '{self.name}': {len(self.grid):,} voxels of {centimetres}>"
 
     def voxels(self) -> VoxelData:
         """All voxels by value, sorted by index."""
@@ -177,3 +191,14 @@ class BaseMap(ABC, Generic[S]):
     @abstractmethod
     def _empty(cls, name: str, channels: int, settings: Any) -> Self:
         """An empty map as described by a file's manifest."""
+
+
+def check_cloud(what: str, cloud: object) -> None:
+    """Raise InputError for anything but a cloud of points; says how to make one of a frame."""
+    if isinstance(cloud, Frame):
+        raise InputError(
+            f"{what}: expected a PointCloud, got a Frame; uf.preprocess(frame).transformed(frame.T_world_camera) "
+            "makes one, and Pipeline.step takes frames"
+        )
+    if not isinstance(cloud, PointCloud):
+        raise InputError(f"{what}: expected a PointCloud, got {shortened(cloud)}")

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 STEPS = 12  # of a walk at most
 ARRIVED = 0.01  # [voxels] from the surface, or 2 % of the way
 FARTHEST = 1.0  # [voxels] that a walk may take
-LEAST_COSINE = 0.95  # between the way and the normal where it ends: else a nearer point is elsewhere
+LEAST_COSINE = (
+    0.95  # between the way and the normal where it ends: else a nearer point is elsewhere
+)
 STEP = 0.05  # [voxels] of finite differences
 # corners of a tetrahedron: sum of f(x + h k) k is 4 h times the gradient
 CORNERS = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], np.float32)

@@ -13,13 +13,14 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, check_range
+from ..errors import InputError, check_range, check_types, strict
 
 MAX_ANCHORS = 1024
 # of the largest eigenvalue of the anchors' kernel matrix: what is smaller is rounding
 LEAST_EIGENVALUE = 1e-13
 
 
+@strict
 @dataclass(frozen=True)
 class EncoderSettings:
     """What defines f_posi; maps fuse and merge only where these agree."""
@@ -34,6 +35,7 @@ class EncoderSettings:
     """Seed of the anchors."""
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_range("encoder: rank", self.rank, 1, MAX_ANCHORS)
         check_range("encoder: anchors", self.anchors, 1, MAX_ANCHORS)
         check_range("encoder: length_scale", self.length_scale, 0.01, 100)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Self, overload
+from typing import Any, Literal, Self, Unpack, overload
 
 import numpy as np
 import taichi as ti
@@ -19,11 +18,12 @@ from ..kernels.cells import CELLS
 from ..kernels.patches import Patches
 from ..runtime import DeviceArray
 from ..types import Frame, ImageView, PointCloud
-from .base_map import BaseMap, Integration
+from .base_map import BaseMap, Integration, check_cloud
 from .binner import Binner, patches_of
 from .encoder import check_points, to_device, window_masks, workers
 from .encoding import position_encoding
 from .kept_window import KeptCells, KeptFeatures
+from .keywords import FeatureKeywords, settings_of, shows_keywords
 from .local_lim import Binned
 from .property_map import NEAREST_REACH
 from .settings import MAX_FEATURE_CHANNELS, FeatureSettings, check_channels
@@ -62,14 +62,15 @@ class FeatureMap(BaseMap[FeatureSettings]):
     kind = "latent"
     settings_type = FeatureSettings
 
+    @shows_keywords(FeatureSettings)
     def __init__(
         self,
         name: str,
         channels: int,
         settings: FeatureSettings | None = None,
-        **overrides: Any,
+        **keywords: Unpack[FeatureKeywords],
     ) -> None:
-        settings = dataclasses.replace(settings or FeatureSettings(), **overrides).sized
+        settings = settings_of(FeatureSettings, settings, dict(keywords), "FeatureMap")
         check_channels(f"feature map '{name}'", channels, MAX_FEATURE_CHANNELS)
         # the first eigenfunction is nearly constant: the mean replaces it, the other rank - 1 stay
         self.rank = settings.encoder.rank - 1
@@ -118,6 +119,7 @@ class FeatureMap(BaseMap[FeatureSettings]):
         Raises as `BaseMap.integrate`, and FrameError where no feature is finite; the map is then
         unchanged.
         """
+        check_cloud("FeatureMap.integrate", cloud)
         features = self._features_of(cloud.features)
         if len(cloud) == 0:
             return Integration(0, 0, len(self))

@@ -92,6 +92,16 @@ def mesh_blocks(keys: NDArray[np.int32]) -> NDArray[np.int32]:
     return _keys(np.unique(np.concatenate(corners)))
 
 
+def blocks_in(keys: NDArray[np.int32], box: NDArray[np.float64]) -> NDArray[np.int32]:
+    """The blocks (M, 3) of voxels (N, 3) that may hold mesh in a box (2, 3) [voxels]."""
+    if not len(keys):
+        return np.zeros((0, 3), np.int32)
+    blocks = mesh_blocks(keys)
+    # a cube of the mesh spans the centres of voxels
+    low, high = np.floor((box - 0.5) / MESH_BLOCK)
+    return blocks[((blocks >= low) & (blocks <= high)).all(axis=1)]
+
+
 def _blocks(keys: NDArray[np.int32]) -> NDArray[np.int32]:
     """The block (N, 3) that each cube (N, 3) lies in."""
     return keys // MESH_BLOCK

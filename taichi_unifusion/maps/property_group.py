@@ -54,7 +54,11 @@ class Part:
 
     def fuse(self, local: LocalLim) -> dict[str, int]:
         """Fuse to each map its part; by name how many voxels that were."""
-        return {each.name: each.grid.fuse(part) for each, part in self._split(local)}
+        fused = {}
+        for each, part in self._split(local):
+            each.compare(part)
+            fused[each.name] = each.grid.fuse(part)
+        return fused
 
     def take_out(self, local: LocalLim) -> None:
         """Undo `fuse`."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Self, overload
+from typing import Literal, Self, Unpack, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from ..runtime import DeviceArray
 from ..types import Frame, PointCloud, largest_magnitude
 from .binner import Binner, patches_of
 from .encoder import Encoder
+from .keywords import PropertyKeywords, settings_of, shows_keywords
 from .local_lim import LocalLim
 from .regression_map import RegressionMap
 from .settings import MAX_PROPERTY_CHANNELS, PropertySettings, check_channels
@@ -39,14 +39,15 @@ class PropertyMap(RegressionMap[PropertySettings]):
     kind = "property"
     settings_type = PropertySettings
 
+    @shows_keywords(PropertySettings)
     def __init__(
         self,
         name: str,
         channels: int,
         settings: PropertySettings | None = None,
-        **overrides: Any,
+        **keywords: Unpack[PropertyKeywords],
     ) -> None:
-        settings = dataclasses.replace(settings or PropertySettings(), **overrides).sized
+        settings = settings_of(PropertySettings, settings, dict(keywords), "PropertyMap")
         check_channels(f"property map '{name}'", channels, MAX_PROPERTY_CHANNELS)
         super().__init__(name, channels, settings, property_layout(channels, settings))
         self.binner = Binner(self.grid, settings.voxel_size, channels)

@@ -17,7 +17,7 @@ from ..kernels.keeping import round_rows
 from ..kernels.layout import Layout
 from ..kernels.patches import Patches, Values
 from ..types import PointCloud
-from .base_map import BaseMap, Integration, S
+from .base_map import BaseMap, Integration, S, check_cloud
 from .binner import Binner
 from .encoder import Decoder, Encoder
 from .local_lim import LocalLim
@@ -144,6 +144,7 @@ class RegressionMap(BaseMap[S]):
         return self.settings.sampling == "cells"
 
     def integrate(self, cloud: PointCloud) -> Integration:
+        check_cloud(f"{type(self).__name__}.integrate", cloud)
         self.flush()
         runtime.check_alive(self.grid.runtime)
         cloud = self.usable(cloud)
@@ -164,6 +165,7 @@ class RegressionMap(BaseMap[S]):
         cleared; evidence is undone only where frames since have not changed the surface. Removing
         what was never integrated spoils the voxels that it touches.
         """
+        check_cloud(f"{type(self).__name__}.remove", cloud)
         self.flush()
         runtime.check_alive(self.grid.runtime)
         cloud = self.usable(cloud)
@@ -193,6 +195,9 @@ class RegressionMap(BaseMap[S]):
         """Hook: update evidence from the cloud's depth image, after it was fused (sign 1) or before
         it is taken out (-1). Only SurfaceMap does.
         """
+
+    def compare(self, local: LocalLim) -> None:
+        """Hook: look at a local LIM beside what the map holds, before it is fused. Only SurfaceMap does."""
 
     def usable(self, cloud: PointCloud) -> PointCloud:
         """The cloud without the points at which something observed is NaN or infinite."""

@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
-from ..errors import InputError, check_choice, check_range, shortened
+from ..errors import InputError, check_choice, check_range, check_types, shortened, strict
 from .encoding import EncoderSettings
 
 MAX_RESOLUTION = 32  # mesh cells along a voxel's edge
@@ -29,6 +29,7 @@ def check_voxel_size(size: float) -> None:
         check_range("voxel_size", size, LEAST_VOXEL, LARGEST_VOXEL, "metres")
 
 
+@strict
 @dataclass(frozen=True)
 class MapSettings:
     """Settings that every Latent Implicit Map has."""
@@ -64,6 +65,7 @@ class MapSettings:
         return self if self.voxel_size else replace(self, voxel_size=self.usual_voxel_size)
 
     def __post_init__(self) -> None:
+        check_types(self)
         check_voxel_size(self.voxel_size)
         check_range("noise", self.noise, 1e-9, 1e9)
         check_range("min_points", self.min_points, 1, 1_000_000)
@@ -74,6 +76,7 @@ class MapSettings:
         check_choice("fusion", self.fusion, ("mean", "information"))
 
 
+@strict
 @dataclass(frozen=True)
 class SurfaceSettings(MapSettings):
     """Settings of the surface map (Sec. IV-B)."""
@@ -110,6 +113,7 @@ class SurfaceSettings(MapSettings):
         check_choice("gpis", self.gpis, ("samples", "derivatives", "both"))
 
 
+@strict
 @dataclass(frozen=True)
 class PropertySettings(MapSettings):
     """Settings of a property map (Sec. IV-C)."""
@@ -143,6 +147,7 @@ class PropertySettings(MapSettings):
         check_choice("prior", self.prior, ("mean", "zero"))
 
 
+@strict
 @dataclass(frozen=True)
 class FeatureSettings(MapSettings):
     """Settings of a map of high-dimensional features (Sec. IV-D)."""

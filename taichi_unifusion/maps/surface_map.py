@@ -4,15 +4,14 @@ surfaces (Sec. IV-B).
 
 from __future__ import annotations
 
-import dataclasses
 from functools import cached_property
-from typing import Any, Self
+from typing import Self, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .. import runtime
-from ..errors import InputError, check_range
+from ..errors import InputError, check_box, check_range, shortened
 from ..kernels import visibility
 from ..kernels.cells import CELLS
 from ..kernels.patches import Patches, Values
@@ -21,10 +20,12 @@ from ..types import Frame, Mesh, PinholeCamera, PointCloud
 from .binner import SurfelBinner, patches_of
 from .distance import distances
 from .encoder import check_points, to_device
+from .keywords import SurfaceKeywords, settings_of, shows_keywords
 from .local_lim import LocalLim
-from .meshing import drop_small_parts, extract_mesh
+from .meshing import blocks_in, drop_small_parts, extract_mesh
 from .regression_map import RegressionMap
 from .settings import MAX_RESOLUTION, SurfaceSettings
+from .sides import LOOKED_AT, Sides, count_sides, steepest
 from .voxel_data import EVIDENCE, VoxelData, surface_layout
 
 
@@ -42,13 +43,17 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
     kind = "surface"
     settings_type = SurfaceSettings
 
-    def __init__(self, settings: SurfaceSettings | None = None, **overrides: Any) -> None:
-        settings = dataclasses.replace(settings or SurfaceSettings(), **overrides).sized
+    @shows_keywords(SurfaceSettings)
+    def __init__(
+        self, settings: SurfaceSettings | None = None, **keywords: Unpack[SurfaceKeywords]
+    ) -> None:
+        settings = settings_of(SurfaceSettings, settings, dict(keywords), "SurfaceMap")
         layout = surface_layout(settings)
         super().__init__("surface", 1, settings, layout, [EVIDENCE] * settings.carve)
         beside = settings.sample_distance
         steps = (0.0,) if settings.gpis == "derivatives" else (-beside, 0.0, beside)
         self.steps = np.array(steps, np.float32)  # of samples along a normal [voxels]
+        self.sides = Sides(0, 0)
         self.binner = SurfelBinner(
             self.grid,
             settings.voxel_size,
@@ -108,6 +113,22 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
             return
         T_camera_world = np.ascontiguousarray(view.T_camera_cloud[None, :3], dtype=np.float32)
         self.vote(view.values[None], view.camera, T_camera_world, (0, grid.count), sign)
+
+    def compare(self, local: LocalLim) -> None:
+        """Count voxels whose surface a window saw from the other side than windows before."""
+        if local.count == 0 or self.layout.information:
+            return
+        keys, encoded, weights = (
+            np.asarray(a if isinstance(a, np.ndarray) else a.to_numpy())[: local.count]
+            for a in (local.keys, local.encoded, local.weights)
+        )
+        slots = self.grid.slots_of(np.ascontiguousarray(keys[:, :3]))
+        known = np.flatnonzero((slots >= 0) & (weights > 0))
+        before = self.grid.rows("latents", slots[known])[:, : self.layout.rank, 0]
+        slopes = 0.5 * self.encoder.tables.encoding.gradient(LOOKED_AT / 2)  # (9, 3, l) a voxel
+        self.sides += count_sides(
+            steepest(before, slopes), steepest(encoded[known, : self.layout.rank, 0], slopes)
+        )
 
     @runtime.compiled_sooner()
     def vote(
@@ -178,19 +199,23 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         resolution: int = 4,
         min_area: float = 0.0,
         *,
+        bounds: ArrayLike | None = None,
         blocks: NDArray[np.int32] | None = None,
         flush: bool = True,
     ) -> Mesh:
         """The zero level by marching cubes on `resolution`^3 cells a voxel; an empty mesh where
         nothing was integrated.
 
+        With `bounds` ((x, y, z), (x, y, z)) world [m], lowest and highest corner, only the triangles that
+        lie in that box.
+
         Connected parts of less than `min_area` square metres are left out. With `blocks` (M, 3), only
         what lies in these, cubes of 16 voxels' edge, as `changed_blocks` gives them; all blocks
         together are the whole mesh, vertices on their borders and normals there included. Without
         `flush`, frames that wait to be fused are left out.
 
-        Raises InputError for a resolution outside 1..32, and where both `min_area` and `blocks` are
-        given.
+        Raises InputError for a resolution outside 1..32, a box that is none, and where both `min_area`
+        and `blocks` are given.
         """
         if flush:
             self.flush()
@@ -202,6 +227,9 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
                 "extract_mesh: min_area needs the whole mesh, since blocks cut parts in pieces: leave "
                 "one of min_area and blocks out"
             )
+        box = None if bounds is None else box_of(bounds)
+        if box is not None and blocks is None:
+            blocks = blocks_in(self.grid.voxel_keys(), box / self.voxel_size)
         mesh = extract_mesh(
             self.grid,
             self.encoder.tables.encoding,
@@ -211,4 +239,21 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
             self.settings.min_evidence,
             blocks,
         )
+        if box is not None:
+            inside = ((mesh.vertices >= box[0]) & (mesh.vertices <= box[1])).all(axis=1)
+            mesh = mesh.part(inside[mesh.faces].all(axis=1))[0]
         return drop_small_parts(mesh, min_area)
+
+
+def box_of(bounds: ArrayLike) -> NDArray[np.float64]:
+    """Two corners (2, 3) [m] of a box, lowest first; six numbers in a row are such too. Raises
+    InputError for anything else.
+    """
+    try:
+        box = np.asarray(bounds, np.float64).reshape(2, 3)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"bounds: expected two corners, as ((0, 0, 0), (2, 2, 1)) in metres, got {shortened(bounds)}"
+        ) from None
+    check_box(box[0].tolist(), box[1].tolist())
+    return box

@@ -234,6 +234,10 @@ class VoxelGrid:
             return np.arange(self.count, dtype=np.int32)
         return np.flatnonzero(self["weights"].to_numpy()[: self.count] > 0).astype(np.int32)
 
+    def rows(self, name: str, slots: NDArray[np.int32]) -> NDArray:
+        """What a field holds of the voxels in `slots`, by value."""
+        return self._pools[name].take(np.ascontiguousarray(slots))
+
     def voxel_keys(self) -> NDArray[np.int32]:
         """(N, 3) voxel indices, in no order."""
         return self._pools[KEYS.name].take(self.used_slots())

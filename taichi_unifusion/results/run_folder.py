@@ -131,6 +131,11 @@ class RunFolder:
         """The regions that a query found."""
         return self.path / "query.json"
 
+    @property
+    def answer_columns(self) -> Path:
+        """The mesh with a column of relevance for each of several texts."""
+        return self.answers.with_suffix(".ply")
+
     def answer_mesh(self, text: str) -> Path:
         """The mesh coloured by relevance to a text, which is given as a part of a file's name."""
         return self.path / f"query-{text}.ply"
@@ -222,7 +227,8 @@ class RunFolder:
         """The files that exist of questions asked: they belong to the maps that were asked."""
         patterns = (self.answer_mesh("*"), self.answer_picture("*"))
         found = {file for pattern in patterns for file in self.path.glob(pattern.name)}
-        found |= {file for file in (self.answers, *self.segmentation_files) if file.exists()}
+        known = (self.answers, self.answer_columns, *self.segmentation_files)
+        found |= {file for file in known if file.exists()}
         return tuple(sorted(found))
 
     @property

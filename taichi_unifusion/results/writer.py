@@ -102,13 +102,14 @@ def write_results(
     writer.write(folder.trajectory, lambda path: write_trajectory(path, run.trajectory))
     writer.write(folder.config, lambda path: write_text(path, dump_config(pipeline.config)))
     _write_color_camera(writer, recording)
-    logger.info("extracting the mesh")
-    extracting = time.perf_counter()
-    resolution = PICTURE_RESOLUTION if pipeline.memory else None
-    mesh = writer.attempt(
-        f"{folder.path}: the mesh could not be extracted",
-        lambda: pipeline.extract_mesh(resolution),
-    )
+    extracting, mesh = time.perf_counter(), None
+    if pipeline.config.mesh.extract:
+        logger.info("extracting the mesh")
+        resolution = PICTURE_RESOLUTION if pipeline.memory else None
+        mesh = writer.attempt(
+            f"{folder.path}: the mesh could not be extracted",
+            lambda: pipeline.extract_mesh(resolution),
+        )
     extracted = time.perf_counter()
     outlook = _find_outlook(writer, mesh, run, up)
     size = None

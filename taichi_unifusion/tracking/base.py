@@ -13,12 +13,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, PoseError
+from ..errors import InputError, PoseError, check_types, strict
 from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame, Trajectory
 
 
+@strict
 @dataclass(frozen=True)
 class TrackingSettings:
     """How poses are found and refined."""
@@ -47,6 +48,7 @@ class TrackingSettings:
     """... nor one that turns it by more than this, in degrees."""
 
     def __post_init__(self) -> None:
+        check_types(self)
         if not self.depth_max > 0.1:
             raise InputError(f"tracking: depth_max must be above 0.1 m, got {self.depth_max}")
         positive = ("keyframe_distance", "keyframe_angle", "prior_distance", "prior_angle")

@@ -118,12 +118,12 @@ def files_in(folder: Path) -> list[str]:
         (
             ["reconstrukt", "7scenes", "x", "--out", "o"],
             2,
-            ["command: 'reconstrukt' is unknown, did you mean 'reconstruct'?"],
+            ["command: 'reconstrukt' is unknown (did you mean 'reconstruct'?)"],
         ),
         (
             ["reconstruct", "7scene", "x", "--out", "o"],
             2,
-            ["'7scene' is unknown, did you mean '7scenes'?", "scannet"],
+            ["'7scene' is unknown (did you mean '7scenes'?)", "scannet"],
         ),
         (
             ["reconstruct", "folder", "nowhere", "--out", "o"],
@@ -228,7 +228,7 @@ def test_an_unknown_key_names_the_right_ones(tmp_path, capsys):
         cli.main(["reconstruct", "synthetic", "--config", str(path), "--out", str(tmp_path / "o")])
         == 2
     )
-    assert "'surface.voxelsize', did you mean 'voxel_size'?" in capsys.readouterr().err
+    assert "'surface.voxelsize' (did you mean 'voxel_size'?)" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
 
@@ -736,3 +736,18 @@ def test_the_app_goes_through_the_same_pipeline(recording, tmp_path, monkeypatch
     with contextlib.suppress(FileNotFoundError):
         (tmp_path / "mesh.obj").unlink()
     assert files_in(tmp_path) == OUTPUTS
+
+
+def test_no_mesh_and_a_part_of_the_mesh(recording, tmp_path, capsys):
+    out = tmp_path / "maps-only"
+    arguments = ["reconstruct", "folder", str(recording), *FLAGS, "--no-mesh"]
+    assert cli.main([*arguments, "--out", str(out)]) == 0
+    assert "mesh " not in capsys.readouterr().out.replace("for the mesh", "")
+    assert (out / "maps" / "surface.safetensors").exists() and not (out / "mesh.ply").exists()
+    assert not (out / "preview.png").exists()
+    box = ["-0.5", "-0.5", "0", "0.5", "0.5", "1.5"]
+    file = tmp_path / "part.ply"
+    assert cli.main(["mesh", str(out), "--bounds", *box, "--out", str(file)]) == 0
+    part = read_mesh(file)
+    low, high = np.array(box, float).reshape(2, 3)
+    assert len(part.faces) and ((part.vertices >= low) & (part.vertices <= high)).all()

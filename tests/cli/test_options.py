@@ -65,7 +65,7 @@ def test_the_papers_way_to_read_an_azure_kinect(data):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--option", "nois=false"], "did you mean 'noise'?; options: frames, width"),
+        (["--option", "nois=false"], "did you mean 'noise'?); options: frames, width"),
         (["--option", "noise=maybe"], "option 'noise': expected true or false, got 'maybe'"),
         (["--option", "noise"], "option 'noise': give it as NAME=VALUE"),
         (["--option", "seed=1", "--option", "seed=2"], "option 'seed' is given twice"),

@@ -183,7 +183,7 @@ def test_networks_run_and_a_property_that_no_frame_gives_costs_nothing_else(
     ("arguments", "told"),
     [
         ([], "say what to map, with --property NAME; properties: infrared, saliency"),
-        (["--property", "salency"], "property 'salency' is unknown, did you mean 'saliency'?"),
+        (["--property", "salency"], "property 'salency' is unknown (did you mean 'saliency'?)"),
         (
             ["--property", "saliency", "--property", "saliency"],
             "'saliency' is asked for twice; give one of them another name",

@@ -124,6 +124,22 @@ def test_a_query_finds_what_is_there_and_says_what_is_not(made, embeddings, caps
     assert "blue: not here" in capsys.readouterr().out
 
 
+def test_what_is_not_found_leaves_no_mesh_and_what_is_unknown_does_not_cost_the_others(
+    made, embeddings, capsys
+):
+    assert ask(made, embeddings, "query", "red", "green", "--threshold", "0.4") == 0
+    both = read_mesh(made / "query.ply")
+    assert {"relevance_red", "relevance_green"} <= set(both.attributes)
+    capsys.readouterr()
+    more = ["--negative", "green", "--threshold", "0.99999"]
+    assert ask(made, embeddings, "query", "red", "mauve", *more) == 2
+    out, err = capsys.readouterr()
+    assert "red: not here; its relevance is" in out and "no vector for 'mauve'" in err
+    assert not list(made.glob("query-red.*")) and not (made / "query.ply").exists()
+    red, mauve = json.loads((made / "query.json").read_text())
+    assert not red["found"] and "mesh" not in red and "no vector" in mauve["reason"]
+
+
 def test_segmentation_names_every_vertex_and_measures_itself(made, embeddings, tmp_path, capsys):
     (tmp_path / "labels.txt").write_text("7 red\n8 green\n9 blue\n")
     mesh = read_mesh(made / "mesh.ply")

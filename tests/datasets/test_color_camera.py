@@ -49,7 +49,7 @@ def test_a_file_is_read_back_as_written(tmp_path):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"fxx": 1.0}, "unknown key 'fxx', did you mean 'fx'?"),
+        ({"fxx": 1.0}, "unknown key 'fxx' (did you mean 'fx'?)"),
         ({"fy": None}, "no fy in it"),
         ({"cx": 4000.0}, "principal point"),
         ({"T_color_depth": [[1, 0], [0, 1]]}, "T_color_depth must be 4 rows of 4 numbers"),

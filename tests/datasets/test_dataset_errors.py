@@ -214,7 +214,7 @@ def test_C1_an_odd_principal_point_is_said(tmp_path):
     [
         (
             CAMERA_YAML + "depth_scael: 5000\n",
-            "unknown key 'depth_scael', did you mean 'depth_scale'",
+            "unknown key 'depth_scael' .did you mean 'depth_scale'",
         ),
         (CAMERA_YAML.replace("fx: 15.0\n", ""), "no fx in it"),
         (CAMERA_YAML.replace("15.0", "wide"), "camera.yaml: fx: expected a number, got 'wide'"),

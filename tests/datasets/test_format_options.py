@@ -55,7 +55,7 @@ def test_options_from_text_open_a_recording():
 @pytest.mark.parametrize(
     ("format", "texts", "told"),
     [
-        ("k4a", ["align=colour"], "option 'align': 'colour' is unknown, did you mean 'color'"),
+        ("k4a", ["align=colour"], "option 'align': 'colour' is unknown .did you mean 'color'"),
         ("k4a", ["align"], "option 'align': give it as NAME=VALUE"),
         ("k4a", ["align=color", "align=depth"], "option 'align' is given twice"),
         ("tum", ["camera=640"], "option 'camera' cannot be given as text"),
@@ -63,11 +63,11 @@ def test_options_from_text_open_a_recording():
         (
             "synthetic",
             ["frame=2"],
-            "'frame' is unknown for format 'synthetic', did you mean 'frames'",
+            "'frame' is unknown for format 'synthetic' .did you mean 'frames'",
         ),
         ("synthetic", ["frames=2.5"], "option 'frames': expected a whole number, got '2.5'"),
         ("synthetic", ["noise=no"], "option 'noise': expected true or false, got 'no'"),
-        ("tumm", [], "format 'tumm' is unknown, did you mean 'tum'"),
+        ("tumm", [], "format 'tumm' is unknown .did you mean 'tum'"),
     ],
 )
 def test_options_that_do_not_fit_are_said(format, texts, told):

@@ -236,7 +236,10 @@ def test_a_model_of_another_kind_is_said(tmp_path, colors):
         ("mean=0.5/0.5", "three means"),
         ("size=4x4", "size: must lie in 8..8192 pixels, got 4x4"),
         ("size=64", "size: expected WIDTHxHEIGHT, got '64'"),
-        ("order=rbg", "order: 'rbg' is unknown, did you mean 'rgb'\\?; choose one of rgb, bgr"),
+        (
+            "order=rbg",
+            "order: 'rbg' is unknown \\(did you mean 'rgb'\\?\\); choose one of rgb, bgr",
+        ),
         ("device=gpu", "device: 'gpu' is unknown"),
     ],
 )

@@ -284,16 +284,16 @@ def test_text_names_method_options_and_settings_of_the_map():
     [
         (
             "salience",
-            "property 'salience' is unknown, did you mean 'saliency'\\?; properties: infrared, saliency",
+            "property 'salience' is unknown \\(did you mean 'saliency'\\?\\); properties: infrared, saliency",
         ),
         ("", "property '' is unknown"),
         (
             "style=skech",
-            "method 'skech' is unknown, did you mean 'sketch'\\?; methods: painting, opencv, sketch, onnx",
+            "method 'skech' is unknown \\(did you mean 'sketch'\\?\\); methods: painting, opencv, sketch, onnx",
         ),
         (
             "style=sketch,colour=true",
-            "option 'colour' is unknown, did you mean 'color'\\?; options: .*voxel_size",
+            "option 'colour' is unknown \\(did you mean 'color'\\?\\); options: .*voxel_size",
         ),
         ("style=sketch,color=maybe", "color: expected true or false, got 'maybe'"),
         ("style=sketch,color=true,color=true", "'color=true' is given twice"),

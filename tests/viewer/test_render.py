@@ -54,7 +54,7 @@ def test_layers_are_shown_in_their_colors_with_a_legend(scene, pose):
 
 
 def test_a_layer_that_is_not_there_is_told(scene):
-    with pytest.raises(InputError, match="no 'hight', did you mean 'height'.* color, height"):
+    with pytest.raises(InputError, match="no 'hight' .did you mean 'height'.* color, height"):
         Picturing(scene, "hight", CAMERA)
 
 

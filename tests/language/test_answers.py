@@ -1,0 +1,127 @@
+"""What becomes of an answer: distinct files, reasons that agree with their numbers, synonyms, regions
+that are one, pictures with what they show.
+"""
+
+from __future__ import annotations
+
+import json
+import unicodedata
+
+import numpy as np
+import pytest
+from places import DEVICE
+
+import taichi_unifusion as uf
+from taichi_unifusion.errors import InputError
+from taichi_unifusion.language.answers import answer_picture, file_name, why_not_here
+from taichi_unifusion.language.embeddings import read_embeddings
+from taichi_unifusion.language.questions import Answer
+from taichi_unifusion.language.regions import find_regions
+from taichi_unifusion.rendering.preview import choose_views
+from taichi_unifusion.types import Mesh
+
+LONG = "a very long description of something that stands in a corner of the room behind"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def runtime():
+    uf.init(DEVICE)
+
+
+def squares(*places: float, size: float = 1.0) -> Mesh:
+    """Flat squares of 10 x 10 points each, at these x [m]."""
+    u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, size, 10), np.linspace(0, size, 10)))
+    i = (np.arange(9)[:, None] * 10 + np.arange(9)).ravel()
+    faces = np.concatenate([np.stack([i, i + 1, i + 11], 1), np.stack([i, i + 11, i + 10], 1)])
+    vertices = np.concatenate([np.stack([u + x, v, 0 * u], 1) for x in places])
+    numbers = np.concatenate([faces + 100 * k for k in range(len(places))])
+    return Mesh(vertices.astype(np.float32), numbers.astype(np.int32))
+
+
+def test_files_of_texts_that_look_alike_differ():
+    texts = [
+        f"{LONG} the sofa",
+        f"{LONG} the door",
+        "🪑",
+        "🛋",
+        "?!",
+        "sofa",
+        "sofa!",
+        "so-fa",
+        "so fa!",
+    ]
+    names = [file_name(text) for text in texts]
+    assert len(set(names)) == len(texts) and all(len(name) < 80 for name in names)
+    assert file_name("sofa") == "sofa" and file_name("Kitchen  table") == "kitchen-table"
+    assert file_name(unicodedata.normalize("NFD", "Küche")) == file_name("küche") == "küche"
+    assert not any(set('/\\:*?"<>|. ') & set(name) for name in names)
+
+
+@pytest.fixture
+def names_file(tmp_path):
+    entries = [
+        {"name": "sofa", "synonyms": ["sofa", "couch", "lounge"]},
+        {"name": "pouch", "synonyms": ["pouch"]},
+        {"name": "crutch"},
+        {"name": unicodedata.normalize("NFD", "Küche"), "synonyms": ["kitchen"]},
+        {"name": "chair"},
+    ]
+    np.save(tmp_path / "vectors.npy", np.eye(5, dtype=np.float32))
+    (tmp_path / "vectors.json").write_text(json.dumps(entries))
+    return read_embeddings(tmp_path / "vectors.npy")
+
+
+@pytest.mark.parametrize(
+    ("text", "row"),
+    [("couch", 0), ("Lounge", 0), ("sofa", 0), ("pouch", 1), ("küche", 3), ("kitchen", 3)],
+)
+def test_synonyms_and_composed_letters_are_found(names_file, text, row):
+    assert names_file.has(text) and names_file.text_features([text]).argmax() == row
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [("chiar", " (did you mean 'chair'?)"), ("coach", ""), ("couches", ""), ("touch", "")],
+)
+def test_only_slips_of_the_fingers_are_guessed(names_file, text, told):
+    with pytest.raises(InputError) as raised:
+        names_file.text_features([text])
+    said = str(raised.value)
+    assert told in said and ("did you mean" in said) == bool(told)
+
+
+def test_pieces_a_few_centimetres_apart_are_one_region():
+    mesh = squares(0, 1.03, 2.3)
+    (one, other) = find_regions(mesh, np.repeat([0.9, 0.8, 0.7], 100))
+    np.testing.assert_allclose(one.box, [[0, 0, 0], [2.03, 1, 0]], atol=1e-5)
+    assert one.area == pytest.approx(2, abs=1e-4) and one.score == pytest.approx(0.85)
+    assert len(one.vertices) == 200 and other.box[0, 0] == pytest.approx(2.3)
+    assert len(find_regions(mesh, np.repeat([0.9, 0.8, 0.7], 100), join=0)) == 3
+    # pieces that are too small alone count together
+    small = squares(0, 0.13, size=0.1)
+    assert len(find_regions(small, np.full(200, 0.9), min_area=0.015)) == 1
+
+
+def test_the_reason_agrees_with_its_numbers():
+    mesh = squares(0)
+    low, high = (
+        Answer("x", np.full(100, level, np.float32), np.zeros(100), ()) for level in (0.3, 0.7)
+    )
+    assert "0.30 at most" in why_not_here(low, mesh, 0.5, 0.01)
+    reason = why_not_here(high, mesh, 0.5, 2.0)
+    assert (
+        "0.70" in reason and "1.0000 m2" in reason and "2 m2" in reason and "nearer" not in reason
+    )
+
+
+def test_a_picture_shows_title_scale_and_a_box_a_region():
+    mesh = squares(0, 2).with_attribute("color", np.full((200, 3), 0.5))
+    regions = find_regions(mesh, np.repeat([0.9, 0.8], 100))
+    views = choose_views(mesh, up=np.array([0.0, 0.0, 1.0]), size=(320, 240))
+    plain = answer_picture(mesh, "sofa", (), views)
+    boxed = answer_picture(mesh, "sofa", regions, views)
+    assert plain.shape == boxed.shape and plain.shape[0] > 240
+    header = plain[: plain.shape[0] - 240]
+    assert (header[:34] < 100).any() and (header[38:50] != 255).any()
+    assert (plain[-240:] != boxed[-240:]).any(axis=2).sum() > 100
+    assert (answer_picture(mesh, "küche 🪑", (), views)[:34] < 100).any()
