@@ -13,7 +13,7 @@ from ..geometry.triangles import vertex_areas
 from ..types import Mesh
 
 THRESHOLD = 0.5  # relevance from which a vertex belongs to a region: the query beats all rivals
-JOIN = 0.05  # [m] between parts of one region
+JOIN = 0.0  # [m] between parts of one region: none, as 0.05 finds 14 instead of 15 of 22 boxes of the house
 MIN_AREA = 0.01  # [m^2] of a region; smaller ones are noise
 
 
@@ -85,12 +85,12 @@ def join_near(
         return joined
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     spots = np.floor(vertices[chosen] / (distance / 2)).astype(np.int64)
     rows = np.unique(np.column_stack([spots, joined[chosen]]), axis=0)
     numbers, of = np.unique(rows[:, 3], return_inverse=True)
-    pairs = of[cKDTree(rows[:, :3]).query_pairs(2.0, output_type="ndarray")].reshape(-1, 2)
+    pairs = of[KDTree(rows[:, :3]).query_pairs(2.0, output_type="ndarray")].reshape(-1, 2)
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
     links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(numbers), len(numbers)))
     _, group = connected_components(links, directed=False)

@@ -131,10 +131,9 @@ def test_what_is_not_found_leaves_no_mesh_and_what_is_unknown_does_not_cost_the_
     both = read_mesh(made / "query.ply")
     assert {"relevance_red", "relevance_green"} <= set(both.attributes)
     capsys.readouterr()
-    more = ["--negative", "green", "--threshold", "0.99999"]
-    assert ask(made, embeddings, "query", "red", "mauve", *more) == 2
+    assert ask(made, embeddings, "query", "red", "mauve", "--min-area", "100") == 2
     out, err = capsys.readouterr()
-    assert "red: not here; its relevance is" in out and "no vector for 'mauve'" in err
+    assert "red: not here; its relevance reaches" in out and "no vector for 'mauve'" in err
     assert not list(made.glob("query-red.*")) and not (made / "query.ply").exists()
     red, mauve = json.loads((made / "query.json").read_text())
     assert not red["found"] and "mesh" not in red and "no vector" in mauve["reason"]

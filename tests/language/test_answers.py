@@ -92,14 +92,14 @@ def test_only_slips_of_the_fingers_are_guessed(names_file, text, told):
 
 def test_pieces_a_few_centimetres_apart_are_one_region():
     mesh = squares(0, 1.03, 2.3)
-    (one, other) = find_regions(mesh, np.repeat([0.9, 0.8, 0.7], 100))
+    (one, other) = find_regions(mesh, np.repeat([0.9, 0.8, 0.7], 100), join=0.05)
     np.testing.assert_allclose(one.box, [[0, 0, 0], [2.03, 1, 0]], atol=1e-5)
     assert one.area == pytest.approx(2, abs=1e-4) and one.score == pytest.approx(0.85)
     assert len(one.vertices) == 200 and other.box[0, 0] == pytest.approx(2.3)
     assert len(find_regions(mesh, np.repeat([0.9, 0.8, 0.7], 100), join=0)) == 3
     # pieces that are too small alone count together
     small = squares(0, 0.13, size=0.1)
-    assert len(find_regions(small, np.full(200, 0.9), min_area=0.015)) == 1
+    assert len(find_regions(small, np.full(200, 0.9), min_area=0.015, join=0.05)) == 1
 
 
 def test_the_reason_agrees_with_its_numbers():
