@@ -164,6 +164,17 @@ def _sized(settings: S, scale: float) -> S:
     return settings if settings.voxel_size else replace(settings, voxel_size=size)
 
 
+def checked(config: object) -> Config:
+    """The configuration, or the defaults for None; raises InputError for anything else."""
+    if config is None:
+        return Config()
+    if not isinstance(config, Config):
+        raise InputError(
+            f"Pipeline: expected Config(...), got {type(config).__name__}; load_config reads a file"
+        )
+    return config
+
+
 def load_config(path: str | Path, base: Config | None = None) -> Config:
     """`base` (the defaults) with what the YAML file says instead.
 

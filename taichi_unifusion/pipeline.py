@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import runtime
-from .config import Config
+from .config import Config, checked
 from .datasets.loading import first_frames, load_ahead
 from .errors import FrameError, InputError, as_known
 from .kernels.patches import Patches
@@ -99,11 +99,7 @@ class Pipeline:
         tiles: str | Path | None = None,
         maps: Mapping[str, BaseMap] | None = None,
     ) -> None:
-        if config is not None and not isinstance(config, Config):
-            raise InputError(
-                f"Pipeline: expected Config(...), got {type(config).__name__}; load_config reads a file"
-            )
-        self.config = config = config or Config()
+        self.config = config = checked(config)
         self.synchronize = synchronize
         made = [make_property(text, config.property_map) for text in config.properties]
         features = [FeatureSource(encoder, config.feature_map)] if encoder is not None else []
