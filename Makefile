@@ -17,8 +17,9 @@ demo:
 test: setup
 	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
-# Recordings, 2,000 mutated ones of each kind; FUZZ="-k mcap" chooses.
+# Every reader of files gets 20,000 mutated ones, recordings 2,000; FUZZ="-k png" chooses.
 fuzz: setup
+	UNIFUSION_FUZZ=20000 .venv/bin/python -m pytest -n $(WORKERS) tests/fuzz/test_fuzz.py $(FUZZ)
 	UNIFUSION_FUZZ=2000 .venv/bin/python -m pytest -n $(WORKERS) tests/fuzz/test_readers.py $(FUZZ)
 
 # Ten thousand frames of one scene: memory must not grow.
