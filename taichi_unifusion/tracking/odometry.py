@@ -119,8 +119,9 @@ class KeyframeOdometry:
         problem = problem_of(found, guess, agreement)
         from_there = guess if expected is None else T_newest_world @ expected
         distance, angle = se3.distance(from_there, found.T_target_source)
-        jump = distance > JUMP[0] or angle > JUMP[1]
-        if not problem and compared.contradicted > (SOME_MOVING if jump else MOST_MOVING):
+        # without a motion that was observed, a wrong place near the guess looks like things that move
+        sure = expected is not None and distance < JUMP[0] and angle < JUMP[1]
+        if not problem and compared.contradicted > (MOST_MOVING if sure else SOME_MOVING):
             problem = f"{compared.contradicted:.0%} of what it sees has moved"
         return found, problem
 
