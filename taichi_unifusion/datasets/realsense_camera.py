@@ -122,7 +122,7 @@ def _is_past(depth: Any, colors: deque[Any]) -> bool:
 
 def _import_sdk() -> ModuleType:
     try:
-        import pyrealsense2
+        import pyrealsense2  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         missing = f" ({error})" if "libusb" in str(error) else ""
         raise MissingDependency(

@@ -78,7 +78,7 @@ def _native(data: bytes, size: int) -> bytes | None:
     ours says why.
     """
     try:
-        import liblzfse
+        import liblzfse  # pyright: ignore[reportMissingImports]
     except ImportError:
         return None
     try:
