@@ -371,14 +371,16 @@ class Pipeline:
         """
         settings = self.config.mesh
         resolution = settings.resolution if resolution is None else resolution
+        if bounds is None and blocks is None:
+            bounds = settings.bounds
         if self.memory and blocks is None:
-            return joined_mesh(self.memory, resolution, settings.min_area)
+            return joined_mesh(self.memory, resolution, settings.min_area, bounds)
         return extract_mesh(
             self.surface,
             self.properties,
             resolution,
             settings.min_area if blocks is None else 0.0,
-            bounds=settings.bounds if bounds is None and blocks is None else bounds,
+            bounds=bounds,
             blocks=blocks,
             flush=flush,
         )

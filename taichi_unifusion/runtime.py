@@ -313,6 +313,7 @@ def _say(sentence: str) -> None:
 def import_taichi() -> Any:
     """Taichi, or what UNIFUSION_TAICHI names, such as `taichi_forge`; kernels are imported after it."""
     os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+    os.environ.setdefault("TI_ENABLE_PYBUF", "0")  # else a line where standard output is redirected
     os.environ.setdefault("HOME", os.path.expanduser("~"))  # without one Taichi ends the process
     name = os.environ.get("UNIFUSION_TAICHI") or "taichi"
     try:

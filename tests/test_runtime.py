@@ -149,3 +149,16 @@ def test_kernels_compiled_sooner_leave_the_settings_as_they_were():
         return config.cfg_optimization
 
     assert [inside(), config.cfg_optimization, inside()] == [False, True, False]
+
+
+def test_starting_under_a_redirected_output_prints_nothing_of_taichis_own():
+    program = (
+        "import contextlib, io\n"
+        "with contextlib.redirect_stdout(io.StringIO()):\n"
+        "    import taichi_unifusion as uf\n"
+        "    uf.init('cpu')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert "shell" not in done.stdout + done.stderr

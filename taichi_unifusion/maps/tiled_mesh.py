@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.triangles import areas
 from ..types import Mesh
@@ -20,9 +20,12 @@ from .working_set import TILE, MapMemory, code_of, tile_of, tiles_around
 BLOCKS = np.array(list(product(range(TILE // MESH_BLOCK), repeat=3)), np.int32)  # of a tile
 
 
-def mesh_pieces(memory: MapMemory, resolution: int) -> Iterator[tuple[int, Mesh]]:
-    """The tiles with surface in order of their code, and the mesh of each with the values of every
-    property; vertices on the borders come with each tile that has them, equal to the bit.
+def mesh_pieces(
+    memory: MapMemory, resolution: int, bounds: ArrayLike | None = None
+) -> Iterator[tuple[int, Mesh]]:
+    """The tiles with surface in order of their code, and the mesh of each, within `bounds` if given,
+    with the values of every property; vertices on the borders come with each tile that has them,
+    equal to the bit.
 
     Raises FileError or MapCorrupt where a tile cannot be read.
     """
@@ -40,7 +43,7 @@ def mesh_pieces(memory: MapMemory, resolution: int) -> Iterator[tuple[int, Mesh]
     for code in sorted(tiles):
         memory.near("surface", set(tiles_around([code])))
         blocks = np.array(tile_of(code), np.int32) * (TILE // MESH_BLOCK) + BLOCKS
-        mesh = surface.extract_mesh(resolution, blocks=blocks, flush=False)
+        mesh = surface.extract_mesh(resolution, bounds=bounds, blocks=blocks, flush=False)
         if len(mesh.faces):
             yield code, with_properties(memory, mesh)
 
@@ -73,9 +76,13 @@ def parts_of_area(
     return area[part] >= least
 
 
-def joined_mesh(memory: MapMemory, resolution: int, min_area: float) -> Mesh:
-    """The mesh of all tiles at once, welded; parts of less than `min_area` square metres are left out."""
-    pieces = [mesh for _, mesh in mesh_pieces(memory, resolution)]
+def joined_mesh(
+    memory: MapMemory, resolution: int, min_area: float, bounds: ArrayLike | None = None
+) -> Mesh:
+    """The mesh of all tiles at once, welded, within `bounds` if given; parts of less than `min_area`
+    square metres are left out.
+    """
+    pieces = [mesh for _, mesh in mesh_pieces(memory, resolution, bounds)]
     if not pieces:
         none = np.zeros((0, 3), np.float32)
         return Mesh(none, none.astype(np.int32), none)

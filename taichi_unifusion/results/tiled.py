@@ -47,7 +47,7 @@ def stream_mesh(path: Path, memory: MapMemory, settings: MeshSettings) -> MeshRe
     """
     voxel_size = memory.sets["surface"].map.voxel_size
     with MeshStream(path) as stream:
-        for code, mesh in mesh_pieces(memory, settings.resolution):
+        for code, mesh in mesh_pieces(memory, settings.resolution, settings.bounds):
             stream.add(mesh, on_border(mesh.vertices, voxel_size), tile_of(code)[0])
         kept = None
         if settings.min_area > 0 and stream.triangles:

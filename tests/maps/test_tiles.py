@@ -106,6 +106,13 @@ def test_the_mesh_by_tiles_is_the_mesh_of_the_whole(whole, tiled):
     np.testing.assert_array_equal(*colors)
 
 
+def test_bounds_cut_the_mesh_of_tiles_as_that_of_the_whole(whole, tiled):
+    bounds = ((-2, -0.5, -2), (20.5, 1, 2))
+    expected, found = (each.extract_mesh(2, bounds=bounds) for each in (whole, tiled[1]))
+    assert 100 < len(expected.faces) < len(whole.extract_mesh(2).faces)
+    np.testing.assert_array_equal(triangles(found), triangles(expected))
+
+
 def test_memory_stays_within_the_limit_and_is_used_again(tmp_path):
     """Nine rooms take no more of pools and index than the first ones did."""
     pipeline = Pipeline(LIMITED, tiles=tmp_path)
