@@ -18,6 +18,8 @@ from taichi_unifusion.datasets.loading import recording_of
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.geometry import se3
 from taichi_unifusion.results import read_run
+from taichi_unifusion.results.ownership import mark_unfinished
+from taichi_unifusion.results.run_folder import RunFolder
 from taichi_unifusion.tracking import TrackedFrame, TrackingResult, Verdict
 from taichi_unifusion.tracking.sequence import PosedFrames
 
@@ -86,6 +88,7 @@ def test_a_mesh_file_is_compared_with_images_as_they_are(made, recording, capsys
 def test_colour_stays_as_recorded_where_asked(recording, tmp_path, capsys):
     arguments = ["reconstruct", "folder", str(recording), *MAPPED, *FLAGS]
     write_color_camera(tmp_path / "color_camera.yaml", RIG)
+    mark_unfinished(RunFolder(tmp_path), ["color_camera.yaml"])
     assert cli.main([*arguments, "--color-camera", "none", "--out", str(tmp_path)]) == 0
     color = json.loads((tmp_path / "metrics.json").read_text())["recording"]["color"]
     assert color["choice"] == "none" and color["camera"] is None

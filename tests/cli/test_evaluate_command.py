@@ -544,7 +544,7 @@ def files(tmp_path, monkeypatch):
         (["rendering", "square.ply", "synthetic", "--every", "0"], "every >= 1"),
         (["trajectory", "poses.txt"], "give the true poses too"),
         (["trajectory", "poses.txt", "nowhere.txt"], "nowhere.txt: no such file"),
-        (["trajectory", "poses.txt", "later.txt"], "0 of 5 estimated poses lie within 0.02 s"),
+        (["trajectory", "poses.txt", "later.txt"], "0 of 5 estimated poses lie within 0.02 frames"),
         (["trajectory", "nan.txt", "poses.txt"], "nan.txt, line 1: holds NaN or infinite numbers"),
         (["trajectory", "square.ply", "poses.txt"], "square.ply"),
         (

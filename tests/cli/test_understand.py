@@ -14,6 +14,8 @@ from taichi_unifusion.cli import main as cli
 from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.maps import FeatureMap
 from taichi_unifusion.results import write_results
+from taichi_unifusion.results.ownership import mark_unfinished
+from taichi_unifusion.results.run_folder import RunFolder
 
 COLORS = np.eye(3)  # names are directions of colour here: what is red is "red"
 NAMES = ("red", "green", "blue")
@@ -257,6 +259,7 @@ def test_frames_without_features_still_give_their_surface(frames, tmp_path):
     pipeline = Pipeline(replace(CONFIG), encoder=Never())
     (tmp_path / "maps").mkdir()
     (tmp_path / "maps" / "features.safetensors").write_text("of an earlier run")
+    mark_unfinished(RunFolder(tmp_path), ["maps/features.safetensors"])
     results = write_results(tmp_path, pipeline, pipeline.run(frames[:1]))
     assert (
         any("no map of features" in str(error) for error in results.failures)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -281,7 +282,9 @@ def test_mark_and_compact_cells_equal_their_twins(grid, cloud, exponent):
     clouds = cloud, moved(taken(cloud, slice(300)), (0.07, 0, 0))
     blocks = touch(grid, *clouds)
     unit = 2.0**exponent  # values are unit times the clouds' normals
-    clouds = [replace(each, normals=each.normals * np.float32(unit)) for each in clouds]
+    clouds = [copy(each) for each in clouds]
+    for each in clouds:  # as values of any size, which a cloud takes as attributes only
+        object.__setattr__(each, "normals", each.normals * np.float32(unit))
     sums = blocks.bin(*clouds, with_positions=False, scale=1 / unit)
     n, voxels = blocks.count, blocks.voxels
     blocks.keys[:, binning.SAMPLE_FRAMES] = np.arange(ROOM)

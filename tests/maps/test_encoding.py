@@ -246,7 +246,7 @@ def test_between_centers_is_f_posi_of_all_eight_voxels_at_the_same_place():
         ({"length_scale": 1e-300}, "length_scale: must lie in 0.01..100"),
         ({"length_scale": float("nan")}, "length_scale.*got nan"),
         ({"rank": 20, "anchors": 10}, "rank must lie in 1..anchors"),
-        ({"rank": "8"}, "rank: expected a number"),
+        ({"rank": "8"}, "rank: expected a whole number"),
     ],
 )
 def test_c11_settings_out_of_range_are_refused_when_they_are_made(values, word):

@@ -318,7 +318,7 @@ def test_an_empty_map_has_an_empty_mesh():
 
 @pytest.mark.parametrize("resolution", [0, 33, -1])
 def test_resolutions_out_of_range_are_refused(resolution):
-    with pytest.raises(InputError, match="resolution must lie in 1..32"):
+    with pytest.raises(InputError, match="resolution: must lie in 1..32"):
         SurfaceMap().extract_mesh(resolution)
 
 
