@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from ..config import Config
 from ..datasets import Dataset
 from ..types import Trajectory
 from .color_camera import AUTO
-from .options import OutputOptions, RecordingOptions, TrackingOptions
+from .options import OutputOptions, RunOptions
 from .terminal import frame_progress
 
 if TYPE_CHECKING:
@@ -28,19 +28,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-class Asked(Protocol):
-    """The options of a command that tracks and maps."""
-
-    @property
-    def recording(self) -> RecordingOptions: ...
-    @property
-    def poses(self) -> TrackingOptions: ...
-    @property
-    def output(self) -> OutputOptions: ...
-    @property
-    def settings(self) -> Config: ...
-
-
 @dataclass(frozen=True)
 class Mapped:
     """Maps of a recording, and what made them."""
@@ -51,7 +38,7 @@ class Mapped:
     written: tuple[Path, ...]  # files that are in the folder already
 
 
-def in_one_pass(recording: Dataset, options: Asked) -> bool:
+def in_one_pass(recording: Dataset, options: RunOptions) -> bool:
     """Whether frames are tracked and fused in one pass: asked for, and possible."""
     poses = options.poses
     if not poses.tracked or poses.tracking_passes == 2:
@@ -104,7 +91,7 @@ def keep_store(folder: RunFolder, store: WindowStore | None) -> tuple[Path, ...]
 
 def map_in_one_pass(
     recording: Dataset,
-    options: Asked,
+    options: RunOptions,
     folder: RunFolder,
     stop: Callable[[], bool],
     encoder: ImageEncoder | None,
@@ -156,7 +143,7 @@ def map_in_one_pass(
     return Mapped(pipeline, run, details, written)
 
 
-def _tracker(options: Asked) -> Any:
+def _tracker(options: RunOptions) -> Any:
     from ..tracking import make_tracker
 
     poses, settings = options.poses, options.settings

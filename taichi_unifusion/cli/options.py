@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
@@ -176,6 +176,19 @@ class OutputOptions:
     """Keep no windows.log of a run in one pass: some megabytes for every second of the recording."""
     up: UpOption = None
     """Which way is up in the world: an axis as z or -y, or three numbers."""
+
+
+class RunOptions(Protocol):
+    """What decides what a run does: the options of a command that makes maps."""
+
+    @property
+    def recording(self) -> RecordingOptions: ...
+    @property
+    def poses(self) -> TrackingOptions: ...
+    @property
+    def output(self) -> OutputOptions: ...
+    @property
+    def settings(self) -> Config: ...
 
 
 @dataclass(frozen=True)

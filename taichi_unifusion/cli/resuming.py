@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
-from ..config import Config, dump_config, load_config
+from ..config import dump_config, load_config
 from ..datasets import Dataset
 from ..errors import FileError, InputError
 from ..results.record import ColorRecord, read_record
 from ..results.run_folder import RunFolder
 from .color_camera import found_color
-from .options import OutputOptions, RecordingOptions, TrackingOptions, source_of
+from .options import RunOptions, source_of
 
 if TYPE_CHECKING:
     from ..networks.encoders import ImageEncoder
@@ -20,19 +20,6 @@ if TYPE_CHECKING:
     from ..results.saver import RunSaver
 
 logger = logging.getLogger(__name__)
-
-
-class RunOptions(Protocol):
-    """What decides what a run does."""
-
-    @property
-    def recording(self) -> RecordingOptions: ...
-    @property
-    def poses(self) -> TrackingOptions: ...
-    @property
-    def output(self) -> OutputOptions: ...
-    @property
-    def settings(self) -> Config: ...
 
 
 def open_saver(
