@@ -32,8 +32,8 @@ import numpy as np
 
 from taichi_unifusion.config import Config
 from taichi_unifusion.files.mesh_reading import read_mesh
-from taichi_unifusion.files.tiles import map_bytes
-from taichi_unifusion.maps.stored import read_stored
+from taichi_unifusion.files.tiles import TileFolder, map_bytes
+from taichi_unifusion.maps.stored import read_stored, read_tile
 from taichi_unifusion.types import Frame
 
 PITCH = np.array([22.0, 14.0])  # [m] from one flat to the next, which is 19 x 11 m
@@ -55,6 +55,7 @@ def main() -> None:
     building.add_argument("--every", type=int, default=10)
     building.add_argument("--map-memory", default="1GB")
     building.add_argument("--out", type=Path)
+    building.add_argument("--no-mesh", action="store_true")
     building.set_defaults(run=run_building)
     for name, function in (("workers", run_workers), ("chaos", run_chaos)):
         command = commands.add_parser(name)
@@ -123,22 +124,31 @@ def run_building(options: argparse.Namespace) -> None:
     for name, each in pipeline.memory.sets.items():
         print(f"{name}: {each.folder.voxels:,} voxels in {len(each.folder.tiles)} tiles")
     print(f"the last flats take {late / early:.2f} of the first ones' time")
-    started = time.perf_counter()
-    size = stream_mesh(out / "mesh.ply", pipeline.memory, config.mesh)
+    blocks = blocks_of(pipeline.memory.sets["surface"].folder)
+    size = blocks * BLOCK**3 * OPEN3D_BYTES_A_VOXEL
     print(
-        f"mesh: {size.triangles:,} triangles in {time.perf_counter() - started:.0f} s, "
-        f"peak memory {peak_mb():.0f} MB"
+        f"Open3D at 1 cm: {blocks:,} blocks of {BLOCK}^3 voxels hold this surface, {size / 1e9:.1f} GB at "
+        f"{OPEN3D_BYTES_A_VOXEL} bytes a voxel"
     )
-    surface = pipeline.memory.sets["surface"].folder.voxels
-    # the 1 cm voxels of blocks of 16^3 in which a surface of one 5 cm layer lies
-    side = 0.05 / OPEN3D_VOXEL
-    blocks = surface * side**2 * 2 / BLOCK**2
-    print(
-        f"Open3D at 1 cm: at least {blocks * BLOCK**3 * OPEN3D_BYTES_A_VOXEL / 1e9:.1f} GB, at "
-        f"{OPEN3D_BYTES_A_VOXEL} bytes a voxel, in blocks of {BLOCK}^3"
-    )
+    if not options.no_mesh:
+        started = time.perf_counter()
+        mesh = stream_mesh(out / "mesh.ply", pipeline.memory, config.mesh)
+        print(
+            f"mesh: {mesh.triangles:,} triangles in {time.perf_counter() - started:.0f} s, "
+            f"peak memory {peak_mb():.0f} MB"
+        )
     if options.out is None:
         shutil.rmtree(out)
+
+
+def blocks_of(surface: TileFolder) -> int:
+    """Blocks of a grid of 1 cm voxels that hold a voxel of a surface map's centre, at least."""
+    total = 0
+    for tile in surface.tiles:
+        centers = (read_tile(surface, tile).keys + 0.5) * surface.manifest["settings"]["voxel_size"]
+        places = np.floor(centers / (BLOCK * OPEN3D_VOXEL)).astype(np.int64)
+        total += len(np.unique(places, axis=0))
+    return total
 
 
 def command_of(options: argparse.Namespace, out: Path, *more: str) -> list[str]:

@@ -18,14 +18,15 @@ from .surface_map import SurfaceMap
 from .working_set import TILE, MapMemory, code_of, tile_of, tiles_around
 
 BLOCKS = np.array(list(product(range(TILE // MESH_BLOCK), repeat=3)), np.int32)  # of a tile
+TOGETHER = 2  # tiles along an edge of those that are meshed at once
 
 
 def mesh_pieces(
     memory: MapMemory, resolution: int, bounds: ArrayLike | None = None
 ) -> Iterator[tuple[int, Mesh]]:
-    """The tiles with surface in order of their code, and the mesh of each, within `bounds` if given,
-    with the values of every property; vertices on the borders come with each tile that has them,
-    equal to the bit.
+    """The mesh of a few tiles with surface at a time, within `bounds` if given, with the values of every
+    property, and the number of the slab along x that it lies in, in ascending order; vertices on the
+    borders of tiles come with each piece that has them, equal to the bit.
 
     Raises FileError or MapCorrupt where a tile cannot be read.
     """
@@ -40,12 +41,16 @@ def mesh_pieces(
         for i, j, k in [tile_of(code)]
         for a, b, c in product((0, 1), repeat=3)
     }
+    groups: dict[tuple[int, ...], list[int]] = {}
     for code in sorted(tiles):
-        memory.near("surface", set(tiles_around([code])))
-        blocks = np.array(tile_of(code), np.int32) * (TILE // MESH_BLOCK) + BLOCKS
+        groups.setdefault(tuple(each // TOGETHER for each in tile_of(code)), []).append(code)
+    for (slab, *_), codes in sorted(groups.items()):
+        memory.near("surface", set(tiles_around(codes)))
+        firsts = np.array([tile_of(code) for code in codes], np.int32) * (TILE // MESH_BLOCK)
+        blocks = (firsts[:, None] + BLOCKS).reshape(-1, 3)
         mesh = surface.extract_mesh(resolution, bounds=bounds, blocks=blocks, flush=False)
         if len(mesh.faces):
-            yield code, with_properties(memory, mesh)
+            yield slab, with_properties(memory, mesh)
 
 
 def with_properties(memory: MapMemory, mesh: Mesh) -> Mesh:

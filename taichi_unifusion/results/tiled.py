@@ -10,7 +10,7 @@ from pathlib import Path
 from ..config import MeshSettings
 from ..files.mesh_stream import MeshStream
 from ..maps.tiled_mesh import mesh_pieces, on_border, parts_of_area
-from ..maps.working_set import MapMemory, tile_of
+from ..maps.working_set import MapMemory
 from .folder_writer import FolderWriter
 from .record import MeshRecord
 
@@ -47,8 +47,8 @@ def stream_mesh(path: Path, memory: MapMemory, settings: MeshSettings) -> MeshRe
     """
     voxel_size = memory.sets["surface"].map.voxel_size
     with MeshStream(path) as stream:
-        for code, mesh in mesh_pieces(memory, settings.resolution, settings.bounds):
-            stream.add(mesh, on_border(mesh.vertices, voxel_size), tile_of(code)[0])
+        for slab, mesh in mesh_pieces(memory, settings.resolution, settings.bounds):
+            stream.add(mesh, on_border(mesh.vertices, voxel_size), slab)
         kept = None
         if settings.min_area > 0 and stream.triangles:
             kept = parts_of_area(stream.places, stream.faces, settings.min_area)
