@@ -26,6 +26,7 @@ from .voxel_data import KEYS, VoxelData, VoxelField
 # Bytes of sparse nodes, of one map and of all that the process ever had: Taichi's pool on the CPU
 # fails silently somewhat above 1.6 GB, and gives nothing back.
 SPARSE_LIMIT, SPARSE_POOL = 1 << 30, 1_450_000_000
+CROWDED = 300_000_000  # bytes of an index from which on `retain` gives nodes back
 BYTES_PER_TREE = 80_000_000  # what an empty index tree takes of the pool
 # a 4^3 leaf with three i32 fields and its share of the nodes above it
 BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16
@@ -84,7 +85,7 @@ class VoxelGrid:
         if free:
             _, tree = free.pop(self._most_alike(free))
             self.runtime.earlier[tree] = _count_free(self.runtime, tree)
-            _clear_tree(tree, self.runtime.device)
+            _clear_tree(tree, nodes_too=self.runtime.device == "cpu")  # not on CUDA: taichi#6401
         else:
             self.runtime.count_tree()
             if _too_large(self.runtime):
@@ -276,7 +277,8 @@ class VoxelGrid:
         self._inherited = max(self._inherited, self._leaves)
         for pool in self._pools.values():
             pool.move_down(slots, self.count)
-        _clear_tree(self.index, self.runtime.device)
+        full = self._leaves * BYTES_PER_LEAF > CROWDED and self.runtime.device == "cpu"
+        _clear_tree(self.index, nodes_too=full)  # not on CUDA: taichi#6401
         self.count, self.empty, self.packed = len(slots), 0, self.packed + 1
         if len(slots):
             kept = self._pools[KEYS.name].take(np.arange(len(slots), dtype=np.int32))
@@ -329,14 +331,19 @@ def _count_free(live: runtime.Runtime, tree: kernels.Index) -> int:
     return max(live.earlier.get(tree, 0), int(kernels.count_leaves(tree)))
 
 
-def _clear_tree(tree: kernels.Index, device: str) -> None:
-    """Take all voxels out of an index tree, whose memory stays with it."""
-    if device == "cpu":
+def _clear_tree(tree: kernels.Index, nodes_too: bool = False) -> None:
+    """Take all voxels out of an index tree, whose memory stays with it: its nodes at their places or,
+    with `nodes_too`, for any place.
+
+    Nodes that are given back again and again while other maps live have crashed processes, on the CPU
+    too: a map does so only where there would be no room else.
+    """
+    tree.slot.fill(0)
+    tree.stamp.fill(0)
+    tree.block.fill(0)
+    if nodes_too:
         topmost: Any = tree.leaf_parent.parent(2)  # pointer node
         topmost.deactivate_all()
-    else:  # there nodes that were given back are not safe to fill again (taichi#6401)
-        tree.slot.fill(0)
-        tree.stamp.fill(0)
 
 
 def _build_tree() -> kernels.Index:

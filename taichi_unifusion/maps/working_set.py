@@ -43,8 +43,8 @@ class WorkingSet:
 
     @property
     def bytes(self) -> int:
-        """Bytes of memory that the voxels take."""
-        return self.map.grid.memory_bytes
+        """Bytes of memory that the voxels take, without their index, which does not shrink."""
+        return len(self.map.grid) * self.map.grid.row_bytes
 
     def codes(self, points: NDArray, halo: int = HALO) -> set[int]:
         """The tiles around points (N, 3) world [m], by code."""

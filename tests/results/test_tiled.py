@@ -31,6 +31,8 @@ def written(folder: Path, limit: str) -> Pipeline:
     mesh = replace(CONFIG.mesh, resolution=2, min_area=0.01)
     config = replace(CONFIG, map_memory=limit, mesh=mesh)
     pipeline = Pipeline(config, tiles=RunFolder(folder).map_folder)
+    if limit:
+        pipeline.memory.limit = 250_000  # bytes, which is less than anybody may ask for
     results = write_results(folder, pipeline, pipeline.run(FRAMES))
     assert not results.failures
     return pipeline
