@@ -103,7 +103,8 @@ def add_votes(
     """Write to `out` some tiles of a surface map with the sum of votes, as `Voters` gives them; raises
     FileError or MapCorrupt.
     """
-    for tile in sorted(tiles):
+
+    def voted(tile: Tile) -> dict[str, NDArray]:
         data = read_tile(surface, tile)
         total = np.zeros((len(data), *EVIDENCE.shape), np.int32)
         for each in votes:
@@ -111,7 +112,9 @@ def add_votes(
                 tensors, _ = each.read(tile, check_votes)
                 total[_rows(data, tensors["keys"])] += tensors[EVIDENCE.name]
         held = np.clip(total, -MOST_VOTES, MOST_VOTES).astype(EVIDENCE.dtype)
-        out.write({tile: {**data.tensors, EVIDENCE.name: held}})
+        return {**data.tensors, EVIDENCE.name: held}
+
+    out.write_each((tile, voted(tile)) for tile in sorted(tiles))
 
 
 def _rows(data: VoxelData, keys: np.ndarray) -> np.ndarray:

@@ -24,6 +24,8 @@ INDEX = "index.json"
 FORMAT, FORMAT_VERSION = "taichi_unifusion tiles", 1
 MAX_INDEX = 256 << 20  # [bytes]; a tile takes some 100
 
+AT_ONCE = 16  # tiles written with one index
+
 Tile = tuple[int, int, int]  # its place, in edges of a tile
 Check = Callable[[Path, dict[str, Any]], object]
 
@@ -137,6 +139,16 @@ class TileFolder:
             raise
         self._turn += 1
         _remove(replaced)
+
+    def write_each(self, tiles: Iterable[tuple[Tile, Mapping[str, NDArray]]]) -> None:
+        """Replace many tiles, as they come; the index is written for some at a time. Raises FileError."""
+        waiting: dict[Tile, Mapping[str, NDArray]] = {}
+        for tile, tensors in tiles:
+            waiting[tile] = tensors
+            if len(waiting) == AT_ONCE:
+                self.write(waiting)
+                waiting = {}
+        self.write(waiting)
 
     def adopt(self, other: TileFolder) -> None:
         """Move the tiles of another folder here, in place of those that are there; raises FileError."""

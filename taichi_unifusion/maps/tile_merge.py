@@ -8,14 +8,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.tiles import Tile, TileFolder
 from . import empty_map
 from .stored import MapDescription, describe_tiles, read_stored, read_tile
 from .working_set import key_codes, tile_of
-
-AT_ONCE = 16  # tiles written with one index
 
 
 def merge_tiles(parts: Sequence[TileFolder], out: TileFolder, tiles: Iterable[Tile]) -> int:
@@ -28,10 +27,10 @@ def merge_tiles(parts: Sequence[TileFolder], out: TileFolder, tiles: Iterable[Ti
     wanted = describe_tiles(out)
     if (wanted.kind, wanted.name, wanted.channels) != _identity(description):
         raise InputError(f"merge: {out.path} is for another map than {parts[0].path}")
-    scratch, voxels = empty_map(description), 0
+    tiles, scratch = sorted(tiles), empty_map(description)
     added = [field for field in wanted.fields if field not in description.fields]
-    waiting: dict[Tile, dict] = {}
-    for tile in sorted(tiles):
+
+    def total(tile: Tile) -> dict[str, NDArray]:
         scratch.grid.retain(np.zeros(0, np.int32))
         for part in parts:
             if tile not in part.tiles:
@@ -43,13 +42,10 @@ def merge_tiles(parts: Sequence[TileFolder], out: TileFolder, tiles: Iterable[Ti
                 scratch.grid.add(data)
         data = scratch.grid.export()
         more = {each.name: np.zeros((len(data), *each.shape), each.dtype) for each in added}
-        waiting[tile] = {**data.tensors, **more}
-        voxels += len(data)
-        if len(waiting) == AT_ONCE:
-            out.write(waiting)
-            waiting = {}
-    out.write(waiting)
-    return voxels
+        return {**data.tensors, **more}
+
+    out.write_each((tile, total(tile)) for tile in tiles)
+    return sum(out.tiles[tile].voxels for tile in tiles if tile in out.tiles)
 
 
 def as_tiles(path: Path, folder: Path) -> TileFolder:
@@ -61,9 +57,10 @@ def as_tiles(path: Path, folder: Path) -> TileFolder:
     description, data = read_stored(path)
     tiles = TileFolder.create(folder, empty_map(description).manifest())
     codes = key_codes(data.keys)
-    for code in np.unique(codes).tolist():
-        rows = codes == code
-        tiles.write({tile_of(code): {name: each[rows] for name, each in data.tensors.items()}})
+    tiles.write_each(
+        (tile_of(code), {name: each[codes == code] for name, each in data.tensors.items()})
+        for code in np.unique(codes).tolist()
+    )
     return tiles
 
 

@@ -81,14 +81,12 @@ class WorkingSet:
         """
         if codes is None:
             self.map.flush()
-        held = self.sizes()
-        wanted = set(held) | self.loaded if codes is None else set(codes)
+        wanted = set(self.sizes()) | self.loaded if codes is None else set(codes)
         wanted = {code for code in wanted if code in self.changed or code not in self.loaded}
         # what lies in the folder of a map that did not wait for it
         self.bring(code for code in wanted if tile_of(code) in self.folder.tiles)
         grid = self.map.grid
-        slots = grid.used_slots()
-        keys = grid["keys"].to_numpy()[slots]
+        slots, keys = grid.used_slots(), grid.voxel_keys()
         of = key_codes(keys)
         chosen = np.isin(of, list(wanted))
         slots, keys, of = slots[chosen], keys[chosen], of[chosen]
@@ -111,9 +109,8 @@ class WorkingSet:
         gone = set(codes)
         self.write(gone)
         grid = self.map.grid
-        slots = grid.used_slots()
-        of = key_codes(grid["keys"].to_numpy()[slots])
-        grid.retain(slots[~np.isin(of, list(gone))])
+        of = key_codes(grid.voxel_keys())
+        grid.retain(grid.used_slots()[~np.isin(of, list(gone))])
         self.loaded -= gone
         for code in gone:
             self.asked.pop(code, None)
