@@ -26,10 +26,11 @@ from .voxel_data import KEYS, VoxelData, VoxelField
 # Bytes of sparse nodes, of one map and of all that the process ever had: Taichi's pool on the CPU
 # fails silently somewhat above 1.6 GB, and gives nothing back.
 SPARSE_LIMIT, SPARSE_POOL = 1 << 30, 1_450_000_000
-CROWDED = 300_000_000  # bytes of an index from which on `retain` gives nodes back
+CROWDED = 300_000_000  # bytes of an index from which on it is emptied by giving nodes back
 BYTES_PER_TREE = 80_000_000  # what an empty index tree takes of the pool
 # a 4^3 leaf with three i32 fields and its share of the nodes above it
 BYTES_PER_LEAF = 64 * 12 + 16 + 64 * 16
+LEAF_CODE = np.array([1 << 24, 1 << 12, 1])  # tells leaves, 4,096 an axis, apart
 # On CUDA one pool of fixed size serves all trees, and running over it ends CUDA for the process. It is
 # taken in chunks of 16,384 nodes: a tree begins with a chunk a level, and with lists; at worst every
 # leaf has three nodes of its own above it. Kept free: what the runtime takes, and four chunks, since
@@ -51,12 +52,12 @@ class VoxelGrid:
         self.packed = 0  # how often `retain` gave voxels other slots
         self.frame = 0
         self.unclosed: Any = None  # `CellArrays` with the keys of the voxels that are touched now
-        self.index = self._borrow_tree()
+        self.index, self._leaves = self._borrow_tree()
         largest = max(field.bytes for field in self.fields)
         least = min(LEAST_CAPACITY, max(LEAST_BYTES // largest, 1))
         capacity = min(max(FIRST_BYTES // largest, least), FIRST_CAPACITY)
         self._pools = {field.name: Pool(field, capacity) for field in (KEYS, *self.fields)}
-        self._leaves, self._touched = 0, 0
+        self._touched = 0  # voxels since the leaves were counted
         self._inherited = self.runtime.earlier.get(self.index, 0)
         self.runtime.grids.add(self)
 
@@ -75,17 +76,20 @@ class VoxelGrid:
         """Voxels that there is room for."""
         return self._pools["keys"].capacity
 
-    def _borrow_tree(self) -> kernels.Index:
-        """An empty index tree: one that a map no longer uses, else a new one, because Taichi never
-        frees the memory of a tree. Raises CapacityError where another one would not be safe.
+    def _borrow_tree(self) -> tuple[kernels.Index, int]:
+        """An index tree without voxels, and its leaves: one that a map no longer uses, else a new one,
+        because Taichi never frees the memory of a tree. Raises CapacityError where another one would
+        not be safe.
         """
         free = self.runtime.free_trees
         if not free and self.runtime.trees >= runtime.MAX_TREES:
             gc.collect()  # maps that only a cycle holds, as the traceback of a run that failed
+        leaves = 0
         if free:
             _, tree = free.pop(self._most_alike(free))
-            self.runtime.earlier[tree] = _count_free(self.runtime, tree)
-            _clear_tree(tree, nodes_too=self.runtime.device == "cpu")  # not on CUDA: taichi#6401
+            leaves = int(kernels.count_leaves(tree))
+            self.runtime.earlier[tree] = max(self.runtime.earlier.get(tree, 0), leaves)
+            leaves = _clear_tree(self.runtime, tree, leaves)
         else:
             self.runtime.count_tree()
             if _too_large(self.runtime):
@@ -101,7 +105,7 @@ class VoxelGrid:
         weakref.finalize(self, free.append, (self.fields, tree))
         self.runtime.followers[self.runtime.last_tree].add(tree)
         self.runtime.last_tree = tree
-        return tree
+        return tree, leaves
 
     def _most_alike(self, free: Sequence[tuple[tuple[VoxelField, ...], kernels.Index]]) -> int:
         """The place of a tree for which kernels are compiled already: that of an equal map, or,
@@ -277,8 +281,7 @@ class VoxelGrid:
         self._inherited = max(self._inherited, self._leaves)
         for pool in self._pools.values():
             pool.move_down(slots, self.count)
-        full = self._leaves * BYTES_PER_LEAF > CROWDED and self.runtime.device == "cpu"
-        _clear_tree(self.index, nodes_too=full)  # not on CUDA: taichi#6401
+        _clear_tree(self.runtime, self.index, self._leaves)
         self.count, self.empty, self.packed = len(slots), 0, self.packed + 1
         if len(slots):
             kept = self._pools[KEYS.name].take(np.arange(len(slots), dtype=np.int32))
@@ -294,8 +297,7 @@ class VoxelGrid:
     def memory_bytes(self) -> int:
         """Bytes that the voxels need: pools as far as they are used, and the index tree."""
         runtime.check_alive(self.runtime)
-        leaves = int(kernels.count_leaves(self.index)) if self.count else 0
-        return self.count * self.row_bytes + leaves * BYTES_PER_LEAF
+        return self.count * self.row_bytes + _leaves_of(self.voxel_keys()) * BYTES_PER_LEAF
 
 
 def _index_bytes(live: runtime.Runtime) -> int:
@@ -323,27 +325,30 @@ def _recount(live: runtime.Runtime) -> None:
     for grid in live.grids:
         grid.recount()
     for _, tree in live.free_trees:
-        live.leaves[tree] = _count_free(live, tree)
+        live.leaves[tree] = max(live.earlier.get(tree, 0), int(kernels.count_leaves(tree)))
 
 
-def _count_free(live: runtime.Runtime, tree: kernels.Index) -> int:
-    """Leaves that a tree which no map uses ever had."""
-    return max(live.earlier.get(tree, 0), int(kernels.count_leaves(tree)))
+def _leaves_of(keys: NDArray[np.int32]) -> int:
+    """Leaves that hold voxels (N, 3)."""
+    return len(np.unique((keys.astype(np.int64) + kernels.INDEX_HALF) // 4 @ LEAF_CODE))
 
 
-def _clear_tree(tree: kernels.Index, nodes_too: bool = False) -> None:
-    """Take all voxels out of an index tree, whose memory stays with it: its nodes at their places or,
-    with `nodes_too`, for any place.
+def _clear_tree(live: runtime.Runtime, tree: kernels.Index, leaves: int) -> int:
+    """Take all voxels out of an index tree of so many leaves, and count those that stay.
 
-    Nodes that are given back again and again while other maps live have crashed processes, on the CPU
-    too: a map does so only where there would be no room else.
+    Its memory stays with it, its nodes at their places: nodes that are given back again and again
+    while other maps live have crashed processes. They are given back, on the CPU (taichi#6401), only
+    where there are many, or where the tree has more than half of its share of what is safe.
     """
     tree.slot.fill(0)
     tree.stamp.fill(0)
     tree.block.fill(0)
-    if nodes_too:
-        topmost: Any = tree.leaf_parent.parent(2)  # pointer node
-        topmost.deactivate_all()
+    share = (SPARSE_POOL - live.trees * BYTES_PER_TREE) / live.trees
+    if live.device != "cpu" or leaves * BYTES_PER_LEAF <= min(CROWDED, share / 2):
+        return leaves
+    topmost: Any = tree.leaf_parent.parent(2)  # pointer node
+    topmost.deactivate_all()
+    return 0
 
 
 def _build_tree() -> kernels.Index:

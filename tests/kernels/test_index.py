@@ -117,7 +117,9 @@ def test_find_release_and_row_copies_equal_a_dict():
     np.testing.assert_array_equal(data.sums, sums[order])
 
 
-def test_count_leaves_counts_4x4x4_groups_of_voxels():
+def test_count_leaves_counts_4x4x4_groups_of_voxels(monkeypatch):
+    gc.collect()
+    monkeypatch.setattr(voxel_grid, "CROWDED", 0)  # a tree that was used before gives nodes back
     grid = a_grid()
     assert kernels.count_leaves(grid.index) == 0
     keys = np.array([[0, 0, 0], [3, 3, 3], [4, 0, 0], [-1, 0, 0], [8191, -8192, 8191]])
@@ -130,7 +132,7 @@ def test_forty_maps_one_after_the_other_share_a_tree_that_starts_empty(cloud):
     grid = a_grid()
     tree, trees = grid.index, runtime.current().trees
     for n in range(40):
-        assert grid.index is tree and grid.count == 0 and kernels.count_leaves(grid.index) == 0
+        assert grid.index is tree and grid.count == 0 == grid.memory_bytes
         here = moved(cloud, (n * VS, 0, 0))
         keys = touch(grid, here.points)
         assert set(map(tuple, keys.tolist())) == reference.touch_points(in_voxels(here.points))
@@ -211,10 +213,9 @@ def test_what_a_map_that_is_gone_touched_again_and_again_counts_once():
         keys = touch(grid, points)
         grid.claim(len(keys), keys, np.ones(len(keys), np.float32), np.empty(len(keys), np.int32))
     counted = kernels.count_leaves(index)
-    assert live.leaves[index] >= 9 * counted > 0
+    assert live.leaves[index] >= 8 * len(keys) + counted > counted
     del grid
     again = a_grid()
-    again.recount()
     assert again.index is index and live.leaves[index] == max(before, counted)
 
 

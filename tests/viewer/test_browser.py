@@ -157,6 +157,10 @@ def test_whoever_types_fast_is_asked_for_all_of_it(shown, page):
         asked = f"query: {word}"
         until(lambda asked=asked: page.stage.layer == asked, "an answer", page.viewer.poll)
         assert page.ask.text.value == word
+        # the end of the line is taken from the box by the server: letters before that would be lost
+        until(
+            lambda word=word: box.get_attribute("value") == word, "the box to be cleared of Enter"
+        )
     until(lambda: "1. score" in text_of(shown), "the list of answers", page.viewer.poll)
 
 
