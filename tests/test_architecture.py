@@ -10,7 +10,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "taichi_unifusion"
 # What every part uses, and the method itself; everything else lies in a folder, a room.
 LOOSE_FILES = {"__init__", "types", "errors", "runtime", "config", "preprocessing", "pipeline"} | {
-    "run_log"
+    "run_log",
+    "__main__",
 }
 # From the ground up. A room imports from lower floors alone, also where it imports within functions.
 FLOORS = [
@@ -30,6 +31,7 @@ FLOORS = [
     {"results"},
     {"viewer", "cluster"},
     {"cli"},
+    {"__main__"},
 ]
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 # `Mesh.save` writes a file; what it imports knows nothing of `types`.
@@ -102,9 +104,20 @@ def test_no_circle():
         visit(name, ())
 
 
+def test_taichi_is_taken_from_kernels():
+    """Imported first by anybody else, it would not read what the runtime sets for it."""
+    others = [name for name in INNER if "kernels" not in name.split(".")]
+    assert [name for name in others if "taichi" in _imported_at_once(name)] == []
+
+
 def test_files_stay_small():
     long = {name: lines for name in INNER if (lines := _lines(name)) > MOST_LINES}
     assert long == {}
+
+
+def _imported_at_once(name: str) -> set[str]:
+    body = ast.parse(MODULES[name].read_text()).body
+    return {alias.name for node in body if isinstance(node, ast.Import) for alias in node.names}
 
 
 def _lines(name: str) -> int:

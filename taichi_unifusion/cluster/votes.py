@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from ..errors import MapCorrupt
 from ..files.tiles import Tile, TileFolder
 from ..geometry.se3 import inverse
+from ..kernels import ti
 from ..maps import empty_map
 from ..maps.stored import describe_tiles, read_tile
 from ..maps.surface_map import SurfaceMap

@@ -7,11 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from ..errors import OutOfRange
 from ..kernels import binning as kernels
+from ..kernels import ti
 from ..kernels.binning import KEY_COLUMNS
 from ..kernels.index import INDEX_HALF, block_of_points, forget_blocks, touch_points
 from ..kernels.patches import Patches, Sink, Target, Values

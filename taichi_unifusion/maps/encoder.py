@@ -7,11 +7,10 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..kernels import query, regression
+from ..kernels import query, regression, ti
 from ..kernels.cells import CELLS
 from ..kernels.layout import Layout
 from ..runtime import Arena, DeviceArray, Runtime, compiled_sooner

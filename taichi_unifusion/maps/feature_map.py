@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self, Unpack, overload
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import FrameError, InputError
 from ..kernels import feature_query as decoding
 from ..kernels import features as kernels
+from ..kernels import ti
 from ..kernels.cells import CELLS
 from ..kernels.patches import Patches
 from ..runtime import DeviceArray

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
+from ..kernels import ti
 from ..kernels.binning import KEY_COLUMNS
 from ..kernels.cells import BLOCK_CELLS
 from ..kernels.pools import copy_rows

@@ -5,10 +5,10 @@ from __future__ import annotations
 from math import prod
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from ..errors import CapacityError
+from ..kernels import ti
 from ..kernels.pools import copy_rows, gather_rows, scatter_rows
 from ..runtime import DeviceArray
 from .voxel_data import VoxelField

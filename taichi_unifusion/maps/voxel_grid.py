@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from .. import runtime
 from ..errors import CapacityError
 from ..kernels import index as kernels
+from ..kernels import ti
 from ..runtime import DeviceArray, grown
 from .pool import Pool
 from .voxel_data import KEYS, VoxelData, VoxelField

@@ -16,11 +16,11 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from ..errors import UniFusionError
 from ..geometry.se3 import distance, inverse
+from ..kernels import ti
 from ..kernels.patches import Patches, Targets
 from ..runtime import Arena, DeviceArray
 from ..types import Frame, PinholeCamera

@@ -70,9 +70,7 @@ def reduce_frame(frame: Frame, depth_min: float, depth_max: float) -> ReducedFra
 
 def build_pyramid(reduced: ReducedFrame) -> SurfelPyramid:
     """Surfel images of a frame: depth, normals, intensity and its slopes at every level."""
-    import taichi as ti
-
-    from ..kernels import images
+    from ..kernels import images, ti
     from ..kernels import registration as kernels
 
     inverse, intensity, camera = (
