@@ -25,7 +25,8 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import astuple, replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ from taichi_unifusion.config import Config
 from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.files.tiles import TileFolder, map_bytes
 from taichi_unifusion.maps.stored import read_stored, read_tile
-from taichi_unifusion.types import Frame
+from taichi_unifusion.types import Frame, PinholeCamera
 
 PITCH = np.array([22.0, 14.0])  # [m] from one flat to the next, which is 19 x 11 m
 # an Open3D VoxelBlockGrid with colour holds per voxel a float, a weight and three colours, as floats
@@ -78,20 +79,40 @@ def main() -> None:
     options.run(options)
 
 
-def building_frames(options: argparse.Namespace) -> Iterator[tuple[int, Frame]]:
-    """The flat of every frame, and the frame at its place in the building."""
+def render_flat(path: Path, every: int, folder: Path) -> None:
+    """Render the frames of one flat into files, in a process of its own: the meshes and images of the
+    flat do not count to the memory of the mapping.
+    """
     from house import load_house
 
-    tour = load_house(options.path, "tour")
-    flat = [tour[i] for i in range(0, len(tour), options.every)]
+    tour = load_house(path, "tour")
+    for n, i in enumerate(range(0, len(tour), every)):
+        frame = tour[i]
+        assert frame.color is not None
+        values = {"depth": frame.depth, "color": frame.color, "T": frame.require_pose()}
+        np.savez(folder / f"{n:03d}.npz", camera=astuple(frame.camera), **values)
+
+
+def building_frames(options: argparse.Namespace) -> Iterator[tuple[int, Frame]]:
+    """The flat of every frame, and the frame at its place in the building."""
     center = (options.columns - 1) / 2, (options.rows - 1) / 2  # the index reaches 205 m each way
-    for n in range(options.rows * options.columns):
-        row, column = divmod(n, options.columns)
-        column = column if row % 2 == 0 else options.columns - 1 - column  # to and fro
-        for i, frame in enumerate(flat):
-            T = frame.require_pose().copy()
-            T[:2, 3] += PITCH * (column - center[0], row - center[1])
-            yield n, replace(frame, T_world_camera=T, index=n * len(flat) + i)
+    with tempfile.TemporaryDirectory() as rendered:
+        spawned = get_context("spawn").Process(
+            target=render_flat, args=(options.path, options.every, Path(rendered))
+        )
+        spawned.start()
+        spawned.join()
+        files = sorted(Path(rendered).iterdir())
+        for n in range(options.rows * options.columns):
+            row, column = divmod(n, options.columns)
+            column = column if row % 2 == 0 else options.columns - 1 - column  # to and fro
+            for i, file in enumerate(files):
+                with np.load(file) as values:
+                    T = values["T"].copy()
+                    T[:2, 3] += PITCH * (column - center[0], row - center[1])
+                    fx, fy, cx, cy, width, height = values["camera"].tolist()
+                    camera = PinholeCamera(fx, fy, cx, cy, int(width), int(height))
+                    yield n, Frame(values["depth"], camera, values["color"], T, n * len(files) + i)
 
 
 def run_building(options: argparse.Namespace) -> None:

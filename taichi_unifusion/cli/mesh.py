@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,6 +20,7 @@ from .results_source import holds_folder
 from .terminal import report
 
 if TYPE_CHECKING:
+    from ..maps.working_set import MapMemory
     from ..types import Mesh
 
 
@@ -70,20 +72,19 @@ def extract_mesh(options: ExtractMesh) -> int:
             "`unifusion reconstruct`"
         )
     check_writable(files[0].parent)
-    from .. import pipeline, runtime
-    from ..maps import PropertyMap, SurfaceMap
-    from ..maps.stored import read_description
+    from .. import runtime
+    from ..results.tiled import open_memory, stream_mesh
 
     runtime.init(options.device)
-    surface = SurfaceMap.load(maps.pop("surface"))
-    properties = {
-        name: PropertyMap.load(path)
-        for name, path in maps.items()
-        if read_description(path).kind == PropertyMap.kind  # others give vertices no value
-    }
-    mesh = pipeline.extract_mesh(
-        surface, properties, options.resolution, options.min_area, bounds=options.bounds
-    )
+    memory = open_memory(maps)
+    if memory is not None and options.out and options.out.suffix.lower() == ".ply":
+        settings = MeshSettings(
+            resolution=options.resolution, min_area=options.min_area, bounds=options.bounds
+        )
+        size = stream_mesh(options.out, memory, settings)
+        print(_sentence(options.out, size.vertices, size.triangles))
+        return report([])
+    mesh = _mesh_of(maps, memory, options)
     meshes = dict.fromkeys(files, mesh)
     if not options.out:
         from ..results.property_files import property_meshes
@@ -94,10 +95,7 @@ def extract_mesh(options: ExtractMesh) -> int:
     for file, shown in meshes.items():
         try:
             write_mesh(file, shown, T_up_world)
-            print(
-                f"{file}: {len(shown.vertices):,} vertices, {len(shown.faces):,} triangles, "
-                f"{format_bytes(file.stat().st_size)}"
-            )
+            print(_sentence(file, len(shown.vertices), len(shown.faces)))
         except UniFusionError as error:  # the other file may still be written
             failures.append(error)
     if not options.out:
@@ -107,6 +105,33 @@ def extract_mesh(options: ExtractMesh) -> int:
         print(f"{folder.path}: {', '.join(updated.files)} follow the new mesh")
         failures += updated.failures
     return report(failures)
+
+
+def _mesh_of(maps: Mapping[str, Path], memory: MapMemory | None, options: ExtractMesh) -> Mesh:
+    """The mesh of saved maps, by name, or of those in tiles that `memory` reads."""
+    from .. import pipeline
+    from ..maps import PropertyMap, SurfaceMap
+    from ..maps.stored import read_description
+    from ..maps.tiled_mesh import joined_mesh
+
+    if memory is not None:
+        return joined_mesh(memory, options.resolution, options.min_area, options.bounds)
+    properties = {
+        name: PropertyMap.load(path)
+        for name, path in maps.items()
+        if read_description(path).kind == PropertyMap.kind  # others give vertices no value
+    }
+    return pipeline.extract_mesh(
+        SurfaceMap.load(maps["surface"]),
+        properties,
+        options.resolution,
+        options.min_area,
+        bounds=options.bounds,
+    )
+
+
+def _sentence(file: Path, vertices: int, triangles: int) -> str:
+    return f"{file}: {vertices:,} vertices, {triangles:,} triangles, {format_bytes(file.stat().st_size)}"
 
 
 def _upright(folder: RunFolder, mesh: Mesh, up: Up | None) -> NDArray | None:

@@ -19,8 +19,9 @@ from ..kernels import ti
 from ..maps import empty_map
 from ..maps.stored import describe_tiles, read_tile
 from ..maps.surface_map import SurfaceMap
+from ..maps.tile_places import TILE, key_codes, tile_of
 from ..maps.voxel_data import EVIDENCE, VoxelData
-from ..maps.working_set import SEEN_HALO, TILE, WorkingSet, key_codes, seen_points, tile_of
+from ..maps.working_set import SEEN_HALO, WorkingSet, seen_points
 from ..preprocessing import PreprocessSettings, invert_depth
 from ..types import Frame, PinholeCamera
 

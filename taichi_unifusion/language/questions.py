@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..maps import FeatureMap
+from ..maps.by_tiles import Features
 from ..networks.encoders import TextEncoder
 from ..types import Mesh
 from .prompts import LOGIT_SCALE, TEMPLATES, competitors, embed, relevance
@@ -39,7 +39,7 @@ class Answer:
 
 
 def ask(
-    features: FeatureMap,
+    features: Features,
     mesh: Mesh,
     encoder: TextEncoder,
     texts: Sequence[str],
@@ -72,7 +72,7 @@ def ask(
 
 
 def _scores(
-    features: FeatureMap, points: NDArray, both: NDArray, distances: NDArray
+    features: Features, points: NDArray, both: NDArray, distances: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Similarity and relevance (N, n) of n queries, which come before their m rivals in `both`, at
     `distances` (n, m).
@@ -102,7 +102,7 @@ class Segmentation:
 
 
 def segment(
-    features: FeatureMap,
+    features: Features,
     points: NDArray,
     encoder: TextEncoder,
     names: Sequence[str],

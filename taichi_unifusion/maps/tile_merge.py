@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..files.tiles import Tile, TileFolder
 from . import empty_map
 from .stored import MapDescription, describe_tiles, read_stored, read_tile
-from .working_set import key_codes, tile_of
+from .tile_places import key_codes, tile_of
 
 
 def merge_tiles(parts: Sequence[TileFolder], out: TileFolder, tiles: Iterable[Tile]) -> int:

@@ -15,20 +15,26 @@ from ..types import Mesh
 from .meshing import MESH_BLOCK, drop_small_parts, parts_by_pieces
 from .property_map import PropertyMap
 from .surface_map import SurfaceMap
-from .working_set import TILE, MapMemory, code_of, tile_of, tiles_around
+from .tile_places import TILE, code_of, tile_of, tiles_around
+from .working_set import MapMemory
 
 BLOCKS = np.array(list(product(range(TILE // MESH_BLOCK), repeat=3)), np.int32)  # of a tile
+OnPiece = Callable[[int, int], None]  # is told how many pieces are done, and how many there are
 TOGETHER = 2  # tiles along an edge of those that are meshed at once
 
 
 def mesh_pieces(
-    memory: MapMemory, resolution: int, bounds: ArrayLike | None = None
+    memory: MapMemory,
+    resolution: int,
+    bounds: ArrayLike | None = None,
+    on_piece: OnPiece = lambda done, total: None,
 ) -> Iterator[tuple[int, Mesh]]:
     """The mesh of a few tiles with surface at a time, within `bounds` if given, with the values of every
     property, and the number of the slab along x that it lies in, in ascending order; vertices on the
     borders of tiles come with each piece that has them, equal to the bit.
 
-    Raises FileError or MapCorrupt where a tile cannot be read.
+    `on_piece` is told how many of the pieces are done. Raises FileError or MapCorrupt where a tile
+    cannot be read.
     """
     surfaces = memory.sets["surface"]
     surface = surfaces.map
@@ -44,13 +50,14 @@ def mesh_pieces(
     groups: dict[tuple[int, ...], list[int]] = {}
     for code in sorted(tiles):
         groups.setdefault(tuple(each // TOGETHER for each in tile_of(code)), []).append(code)
-    for (slab, *_), codes in sorted(groups.items()):
+    for done, ((slab, *_), codes) in enumerate(sorted(groups.items()), 1):
         memory.near("surface", set(tiles_around(codes)))
         firsts = np.array([tile_of(code) for code in codes], np.int32) * (TILE // MESH_BLOCK)
         blocks = (firsts[:, None] + BLOCKS).reshape(-1, 3)
         mesh = surface.extract_mesh(resolution, bounds=bounds, blocks=blocks, flush=False)
         if len(mesh.faces):
             yield slab, with_properties(memory, mesh)
+        on_piece(done, len(groups))
 
 
 def with_properties(memory: MapMemory, mesh: Mesh) -> Mesh:
@@ -82,12 +89,16 @@ def parts_of_area(
 
 
 def joined_mesh(
-    memory: MapMemory, resolution: int, min_area: float, bounds: ArrayLike | None = None
+    memory: MapMemory,
+    resolution: int,
+    min_area: float,
+    bounds: ArrayLike | None = None,
+    on_piece: OnPiece = lambda done, total: None,
 ) -> Mesh:
     """The mesh of all tiles at once, welded, within `bounds` if given; parts of less than `min_area`
-    square metres are left out.
+    square metres are left out. Otherwise as `mesh_pieces`.
     """
-    pieces = [mesh for _, mesh in mesh_pieces(memory, resolution, bounds)]
+    pieces = [mesh for _, mesh in mesh_pieces(memory, resolution, bounds, on_piece)]
     if not pieces:
         none = np.zeros((0, 3), np.float32)
         return Mesh(none, none.astype(np.int32), none)

@@ -39,6 +39,7 @@ CUDA_TREE, CUDA_CHUNK, CUDA_RESERVE = 90_000_000, 66_000_000, 330_000_000
 NODES_PER_CHUNK = 16_384
 # room to begin with: what a room needs, so that hardly any video waits, but little memory
 FIRST_CAPACITY, LEAST_CAPACITY, FIRST_BYTES, LEAST_BYTES = 131_072, 4096, 16 << 20, 64 << 20
+LARGE = 1 << 20  # voxels from which on room grows by a quarter at a time: it takes memory at once
 
 
 class VoxelGrid:
@@ -150,7 +151,7 @@ class VoxelGrid:
 
     def recount(self) -> None:
         """Count the leaves of the index tree."""
-        self._leaves, self._touched = int(kernels.count_leaves(self.index)), 0
+        self._leaves, self._touched = self._count_leaves(), 0
         self._note_leaves()
 
     def _note_leaves(self) -> None:
@@ -179,6 +180,8 @@ class VoxelGrid:
         if needed <= self.capacity:
             return
         rows = grown(self.capacity, needed)
+        if self.capacity >= LARGE:
+            rows = max(self.capacity + self.capacity // 4, needed)
         for pool in self._pools.values():  # what does not fit is said before the first one changes
             pool.check_room(rows, len(self))
         for pool in self._pools.values():
@@ -294,10 +297,19 @@ class VoxelGrid:
         return sum(field.bytes for field in (KEYS, *self.fields))
 
     @property
+    def index_bytes(self) -> int:
+        """Bytes that the index tree takes; nodes that were given back stay in Taichi's pool."""
+        return max(self._inherited, self._count_leaves()) * BYTES_PER_LEAF
+
+    @property
     def memory_bytes(self) -> int:
         """Bytes that the voxels need: pools as far as they are used, and the index tree."""
         runtime.check_alive(self.runtime)
         return self.count * self.row_bytes + _leaves_of(self.voxel_keys()) * BYTES_PER_LEAF
+
+    def _count_leaves(self) -> int:
+        runtime.check_alive(self.runtime)
+        return int(kernels.count_leaves(self.index))
 
 
 def _index_bytes(live: runtime.Runtime) -> int:

@@ -8,28 +8,28 @@ longest are written and dropped, and come back when they are seen again.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..files.tiles import Tile, TileFolder
+from ..files.tiles import TileFolder
 from ..types import Frame
 from . import empty_map
 from .base_map import BaseMap
 from .settings import parse_bytes
 from .stored import describe_tiles, read_tile
+from .tile_places import TILE, code_of, key_codes, place_codes, tile_of
 
 logger = logging.getLogger(__name__)
 
-TILE = 64  # voxels along an edge of a tile
-KEPT_SHARE = 0.6  # of the limit that stays when tiles are dropped, so that it is done rarely
+KEPT_SHARE = 0.6  # of the room that stays taken when tiles are dropped, so that it is done rarely
+LEAST_SHARE = 0.4  # of the limit that voxels have, however large their index is
 RAY_STEP = 32  # [px] between the rays by which the tiles that a frame sees are found
 SEEN_HALO = 4  # voxels around their points that count as seen
 HALO = 2  # voxels around a point that its value may depend on
-CODE_BITS, CODE_OFFSET = 12, 1 << 11  # a tile's place as one number; 16,384 voxels are 256 tiles
 
 
 class WorkingSet:
@@ -43,14 +43,14 @@ class WorkingSet:
 
     @property
     def bytes(self) -> int:
-        """Bytes of memory that the voxels take, without their index, which does not shrink."""
+        """Bytes of memory that the voxels take, without their index, whose nodes stay."""
         return len(self.map.grid) * self.map.grid.row_bytes
 
     def codes(self, points: NDArray, halo: int = HALO) -> set[int]:
         """The tiles around points (N, 3) world [m], by code."""
         voxels = points / self.map.voxel_size
         reach = np.array(np.meshgrid(*[[-halo, halo]] * 3)).reshape(3, -1).T
-        around = np.concatenate([_codes_of(voxels + step) for step in reach])
+        around = np.concatenate([place_codes(voxels + step) for step in reach])
         return set(np.unique(around).tolist())
 
     def bring(self, codes: Iterable[int]) -> None:
@@ -169,7 +169,11 @@ class MapMemory:
         never those of `needed`; raises FileError.
         """
         total = sum(each.bytes for each in self.sets.values())
-        if total <= self.limit:
+        if total <= LEAST_SHARE * self.limit:
+            return
+        index = sum(each.map.grid.index_bytes for each in self.sets.values())
+        room = max(self.limit - index, LEAST_SHARE * self.limit)
+        if total <= room:
             return
         old = []
         for name, each in self.sets.items():
@@ -179,7 +183,7 @@ class MapMemory:
             old += [(each.asked.get(code, 0), code, name, sizes[code] * voxel) for code in spare]
         gone: dict[str, list[int]] = {}
         for _, code, name, size in sorted(old):
-            if total <= KEPT_SHARE * self.limit:
+            if total <= KEPT_SHARE * room:
                 break
             total -= size
             gone.setdefault(name, []).append(code)
@@ -228,38 +232,3 @@ def seen_points(frame: Frame, step: float) -> NDArray[np.float64]:
     places = np.minimum(steps, depth[:, None])[..., None] * rays[:, None]
     T_world_camera = frame.require_pose()
     return places.reshape(-1, 3) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-
-
-def key_codes(keys: NDArray[np.int32]) -> NDArray[np.int64]:
-    """The tile (N,) of every voxel (N, 3), as a number."""
-    tiles = (keys // TILE).astype(np.int64) + CODE_OFFSET
-    return tiles[:, 0] << 2 * CODE_BITS | tiles[:, 1] << CODE_BITS | tiles[:, 2]
-
-
-def _codes_of(voxels: NDArray) -> NDArray[np.int64]:
-    """The tile (N,) of places (N, 3) in voxels."""
-    most = (CODE_OFFSET - 1) * TILE
-    return key_codes(np.floor(np.clip(voxels, -most, most)).astype(np.int32))
-
-
-def code_of(tile: Tile) -> int:
-    """The number of a tile."""
-    i, j, k = (each + CODE_OFFSET for each in tile)
-    return i << 2 * CODE_BITS | j << CODE_BITS | k
-
-
-def tile_of(code: int) -> Tile:
-    """The place of a tile."""
-    last = (1 << CODE_BITS) - 1
-    i, j, k = (int(code) >> shift & last for shift in (2 * CODE_BITS, CODE_BITS, 0))
-    return i - CODE_OFFSET, j - CODE_OFFSET, k - CODE_OFFSET
-
-
-def tiles_around(codes: Iterable[int]) -> Iterator[int]:
-    """Codes of tiles and of the 26 beside each; some come more than once."""
-    for code in codes:
-        i, j, k = tile_of(code)
-        for di in (-1, 0, 1):
-            for dj in (-1, 0, 1):
-                for dk in (-1, 0, 1):
-                    yield code_of((i + di, j + dj, k + dk))

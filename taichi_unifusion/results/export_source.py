@@ -16,7 +16,7 @@ from ..errors import FileError, InputError
 from ..files.mesh_reading import read_mesh
 from ..geometry.gravity import Up
 from ..geometry.triangles import sample_patches
-from ..maps import PropertyMap
+from ..maps.by_tiles import open_property
 from ..rendering.baking import ColorField
 from ..rendering.legend import property_mesh
 from ..rendering.look import Look, colorize, shown_range
@@ -57,7 +57,7 @@ class ExportSource:
                 "triangle with --vertex-colors, or map them with `unifusion reconstruct`"
             )
         runtime.init(self.device)
-        field = PropertyMap.load(file)
+        field = open_property(file)
 
         def color(points: NDArray) -> tuple[NDArray, NDArray]:
             values, known = field.query(points, return_valid=True)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from ..errors import FileError, UniFusionError
+from ..errors import FileError, MapCorrupt, UniFusionError
 from ..files.mesh_reading import read_any_mesh
 from ..files.tiles import TileFolder, map_bytes
-from ..maps.stored import read_stored
+from ..maps.stored import MapDescription, describe_tiles, read_stored, read_tile
+from ..maps.tile_places import code_of, key_codes
 from .lock import who_writes
 from .record import Source, read_record
 from .run_folder import RunFolder
@@ -74,7 +75,7 @@ def inspect(path: Path) -> Inspection:
 
 def _describe_map(file: Path) -> list[str]:
     """A row of MAP_COLUMNS, after everything was checked that loading the map would."""
-    stored, _ = read_stored(file)
+    stored = _checked(file)
     settings, encoder = stored.settings, stored.settings.encoder
     return [
         stored.name,
@@ -86,6 +87,21 @@ def _describe_map(file: Path) -> list[str]:
         settings.fusion,
         str(stored.version),
     ]
+
+
+def _checked(file: Path) -> MapDescription:
+    """What a map is, all of whose voxels make sense; of one in tiles one tile is read at a time."""
+    if not TileFolder.is_one(file):
+        return read_stored(file)[0]
+    folder = TileFolder.open(file)
+    for tile in folder.tiles:
+        strangers = key_codes(read_tile(folder, tile).keys) != code_of(tile)
+        if strangers.any():
+            raise MapCorrupt(
+                f"{file / folder.tiles[tile].file}: holds voxels of another tile than {tile}; integrate the "
+                "frames again"
+            )
+    return describe_tiles(folder)
 
 
 def _size(file: Path) -> str:

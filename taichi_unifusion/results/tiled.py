@@ -5,16 +5,20 @@ while it is made.
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 from ..config import MeshSettings
 from ..files.mesh_stream import MeshStream
+from ..files.tiles import TileFolder
+from ..maps.stored import describe_tiles
 from ..maps.tiled_mesh import mesh_pieces, on_border, parts_of_area
 from ..maps.working_set import MapMemory
 from .folder_writer import FolderWriter
 from .record import MeshRecord
 
 logger = logging.getLogger(__name__)
+READING_MEMORY = 1_000_000_000  # bytes of maps in tiles that are read again
 PICTURE_RESOLUTION = 1  # cells a voxel of the mesh that pictures are drawn from
 
 
@@ -22,6 +26,22 @@ def write_tiles(writer: FolderWriter, memory: MapMemory) -> None:
     """Write what of the maps is in memory; their indices stand for all their files."""
     for each in memory.sets.values():
         writer.write(each.folder.index, lambda _, each=each: each.write())
+
+
+def open_memory(maps: Mapping[str, Path]) -> MapMemory | None:
+    """Memory for the surface and the properties among saved maps, by name, that lie in tiles, of which
+    a part is read at a time; None where the surface does not. Raises FileError or MapCorrupt.
+    """
+    tiled = {name: path for name, path in maps.items() if TileFolder.is_one(path)}
+    if "surface" not in tiled:
+        return None
+    folders = {name: TileFolder.open(path) for name, path in tiled.items()}
+    shown = {
+        name: each
+        for name, each in folders.items()
+        if describe_tiles(each).kind in ("surface", "property")  # others give vertices no value
+    }
+    return MapMemory.over(shown, READING_MEMORY)
 
 
 def write_mesh_by_tiles(

@@ -9,7 +9,7 @@ from .. import runtime
 from ..errors import FileError, InputError
 from ..files.mesh_reading import read_mesh
 from ..files.trajectories import read_trajectory
-from ..maps import FeatureMap
+from ..maps.by_tiles import Features, open_features
 from ..types import Mesh, Trajectory
 from .outlook import Outlook, read_outlook
 from .run_folder import RunFolder
@@ -20,7 +20,7 @@ class Understood:
     """What a results folder holds for questions."""
 
     mesh: Mesh
-    features: FeatureMap
+    features: Features
     trajectory: Trajectory | None
     outlook: Outlook
 
@@ -46,7 +46,7 @@ def read_understood(directory: Path, device: str) -> Understood:
     poses = folder.trajectory
     return Understood(
         mesh,
-        FeatureMap.load(folder.features),
+        open_features(folder.features),
         read_trajectory(poses) if poses.exists() else None,
         read_outlook(folder, mesh),
     )

@@ -18,9 +18,12 @@ from ..files.atomic import read_bytes
 from ..files.json_text import parse_json
 from ..files.mesh_reading import read_any_mesh, read_mesh
 from ..files.ply import color_to_uint8
+from ..files.tiles import TileFolder
 from ..files.trajectories import read_trajectory
 from ..geometry.triangles import SurfaceDistance
-from ..maps.stored import read_stored
+from ..maps.stored import read_description, read_stored, read_tile
+from ..maps.tile_places import key_codes, rows_by_tile, tile_of
+from ..maps.voxel_data import VoxelData
 from ..rendering.look import Look
 from ..rendering.mesh_checks import check_mesh
 from ..results.outlook import find_mesh_up, read_up
@@ -135,22 +138,43 @@ def _map_layers(mesh: Mesh, folder: RunFolder) -> list[Layer]:
     if file is None:
         return []
     try:
-        stored, data = read_stored(file)
+        size = read_description(file).settings.voxel_size
+        weight, votes = np.full((2, len(mesh.vertices)), np.nan, np.float32)
+        for rows, data in _voxels_at(file, np.floor(mesh.vertices / size).astype(np.int32)):
+            row = _rows_of(data.keys, np.floor(mesh.vertices[rows] / size).astype(np.int64))
+            weight[rows] = _known(data.weights, row)
+            if data.evidence is not None:
+                votes[rows] = _votes(data.evidence, mesh.vertices[rows] / size, row)
     except UniFusionError as error:
         logger.warning("%s: no weights to show (%s)", file, error)
         return []
-    size, evidence = stored.settings.voxel_size, data.evidence
-    row = _rows_of(data.keys, np.floor(mesh.vertices / size).astype(np.int64))
-    weight = _known(data.weights, row)
     layers = [Layer.of_values("weight", weight, Look("magma", None, "weight of the voxel"))]
-    if evidence is not None:
-        cells = np.floor(mesh.vertices * (CELLS / size)).astype(np.int64) % CELLS
-        cell = (cells[:, 0] * CELLS + cells[:, 1]) * CELLS + cells[:, 2]
-        votes = evidence[np.maximum(row, 0), cell].astype(np.float32)
-        votes[row < 0] = np.nan
+    if not np.isnan(votes).all():
         look = Look("diverging", None, "evidence: views that saw it less those that saw through it")
         layers.append(Layer.of_values("evidence", votes, look))
     return layers
+
+
+def _voxels_at(file: Path, keys: NDArray[np.int32]) -> Iterator[tuple[NDArray[np.intp], VoxelData]]:
+    """Rows among voxels (N, 3), and what a saved map holds around them: all of it, or of one in tiles
+    one tile after the other.
+    """
+    if not TileFolder.is_one(file):
+        yield np.arange(len(keys)), read_stored(file)[1]
+        return
+    folder = TileFolder.open(file)
+    for code, rows in rows_by_tile(key_codes(keys)):
+        if tile_of(code) in folder.tiles:
+            yield rows, read_tile(folder, tile_of(code))
+
+
+def _votes(evidence: NDArray, places: NDArray, row: NDArray) -> NDArray[np.float32]:
+    """The votes (N,) of the cells that places (N, 3) in voxels lie in, NaN where there is no row."""
+    cells = np.floor(places * CELLS).astype(np.int64) % CELLS
+    cell = (cells[:, 0] * CELLS + cells[:, 1]) * CELLS + cells[:, 2]
+    votes = evidence[np.maximum(row, 0), cell].astype(np.float32)
+    votes[row < 0] = np.nan
+    return votes
 
 
 def _rows_of(keys: NDArray, wanted: NDArray) -> NDArray[np.int64]:

@@ -24,7 +24,9 @@ from .results_scene import SceneOptions, find_recorded_run, layers_of, open_scen
 from .scene import Scene, SceneMesh
 
 if TYPE_CHECKING:
-    from ..maps import FeatureMap, PropertyMap, SurfaceMap
+    from ..maps import PropertyMap, SurfaceMap
+    from ..maps.by_tiles import Features
+    from ..maps.working_set import MapMemory
     from ..networks.encoders import TextEncoder
 
 PIECE = 64  # blocks that are extracted at once
@@ -116,20 +118,31 @@ class ResultsSource:
         Raises InputError for a resolution that cannot be, FileError or MapCorrupt where a map
         cannot be read.
         """
-        from ..maps.meshing import drop_small_parts, mesh_blocks
-        from ..pipeline import extract_mesh
+        from ..maps.tiled_mesh import joined_mesh
 
         folder = self._folder
         settings = load_config(folder.config).mesh if folder.config.exists() else MeshSettings()
+        if self._memory is not None:
+            mesh = joined_mesh(self._memory, resolution, settings.min_area, on_piece=on_piece)
+        else:
+            mesh = self._whole_mesh(resolution, settings.min_area, on_piece)
+        layers = layers_of(mesh, folder, scene, self.options.compare)
+        return SceneMesh(shown.name, mesh, layers).moved(shown.offset)
+
+    def _whole_mesh(
+        self, resolution: int, min_area: float, on_piece: Callable[[int, int], None]
+    ) -> Mesh:
+        """The mesh of maps that are in memory."""
+        from ..maps.meshing import drop_small_parts, mesh_blocks
+        from ..pipeline import extract_mesh
+
         surface, pieces = self._surface, []
         blocks = mesh_blocks(surface.grid.voxel_keys())
         for first in range(0, len(blocks), PIECE):
             part = blocks[first : first + PIECE]
             pieces.append(extract_mesh(surface, self._properties, resolution, blocks=part))
             on_piece(min(first + PIECE, len(blocks)), len(blocks))
-        mesh = drop_small_parts(welded(pieces), settings.min_area)
-        layers = layers_of(mesh, folder, scene, self.options.compare)
-        return SceneMesh(shown.name, mesh, layers).moved(shown.offset)
+        return drop_small_parts(welded(pieces), min_area)
 
     def ask(self, shown: SceneMesh, text: str) -> ShownAnswer:
         """Where on a mesh of this folder something is; raises InputError where the encoder has no
@@ -163,11 +176,18 @@ class ResultsSource:
         return self.folder
 
     @cached_property
+    def _memory(self) -> MapMemory | None:
+        from ..results.tiled import open_memory
+
+        runtime.current()
+        return open_memory(self._folder.maps)
+
+    @cached_property
     def _surface(self) -> SurfaceMap:
         from ..maps import SurfaceMap
 
         runtime.current()
-        return SurfaceMap.load(self._folder.map("surface"))
+        return SurfaceMap.load(self._folder.saved_map("surface"))
 
     @cached_property
     def _properties(self) -> dict[str, PropertyMap]:
@@ -181,11 +201,11 @@ class ResultsSource:
         }
 
     @cached_property
-    def _features(self) -> FeatureMap:
-        from ..maps import FeatureMap
+    def _features(self) -> Features:
+        from ..maps.by_tiles import open_features
 
         runtime.current()
-        return FeatureMap.load(self._folder.features)
+        return open_features(self._folder.features)
 
     @cached_property
     def _encoder(self) -> TextEncoder:

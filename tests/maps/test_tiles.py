@@ -15,8 +15,8 @@ from taichi_unifusion.errors import FileError, InputError, MapCorrupt
 from taichi_unifusion.files.tiles import TileFolder
 from taichi_unifusion.maps.settings import parse_bytes
 from taichi_unifusion.maps.stored import read_tile
+from taichi_unifusion.maps.tile_places import TILE, code_of, key_codes, tile_of, tiles_around
 from taichi_unifusion.maps.voxel_data import VoxelData
-from taichi_unifusion.maps.working_set import TILE, code_of, key_codes, tile_of, tiles_around
 from taichi_unifusion.pipeline import Pipeline
 
 PLACES = (
