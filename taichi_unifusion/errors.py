@@ -61,6 +61,10 @@ class PoseError(FrameError):
     """A pose is missing, not finite or not a rigid transform."""
 
 
+class NoOverlap(DatasetError):
+    """Two recordings do not see the same place, or not surely."""
+
+
 class OutOfRange(InputError):
     """A point lies outside the index range of a map."""
 

@@ -13,6 +13,7 @@ from ..config import Config
 from ..datasets import Dataset
 from ..types import Trajectory
 from .color_camera import AUTO
+from .into import Addition, begin_windows, remembered
 from .options import OutputOptions, RunOptions
 from .terminal import frame_progress
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from ..pipeline import Pipeline
     from ..results import RunFolder
     from ..run_log import RunResult
-    from ..tracking import CurrentPoses
+    from ..tracking import CurrentPoses, TrackingResult
     from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
@@ -44,6 +45,8 @@ def in_one_pass(recording: Dataset, options: RunOptions) -> bool:
     if not poses.tracked or poses.tracking_passes == 2:
         return False
     obstacle = _obstacle(options.settings)
+    if options.output.into is not None:
+        obstacle = "the place of the recording in the map (--into) is found from all frames"
     if options.recording.color_camera == AUTO and not recording.registered:
         obstacle = (
             "the colour camera is found from the poses of all frames; --color-camera knows it"
@@ -63,10 +66,16 @@ def _obstacle(settings: Config) -> str:
 
 
 def open_store(
-    folder: RunFolder, options: OutputOptions, settings: Config, *, moves: bool
+    folder: RunFolder,
+    options: OutputOptions,
+    settings: Config,
+    *,
+    moves: bool,
+    added: Addition | None = None,
 ) -> WindowStore | None:
     """A file for what windows are fused from, under a name for the time being; where it is not
-    wanted, memory if the map `moves`, else None.
+    wanted, memory if the map `moves`, else None. A recording that is `added` to a map goes on with its
+    file.
     """
     from ..maps.window_store import WindowStore
 
@@ -75,6 +84,8 @@ def open_store(
     if options.forget:
         return WindowStore() if moves else None
     folder.new_windows.unlink(missing_ok=True)
+    if added and added.windows:
+        return begin_windows(folder, added.windows)
     return WindowStore(folder.new_windows)
 
 
@@ -87,6 +98,19 @@ def keep_store(folder: RunFolder, store: WindowStore | None) -> tuple[Path, ...]
     folder.new_windows.replace(folder.windows)
     store.moved_to(folder.windows)
     return (folder.windows,)
+
+
+def keep_tracking(folder: RunFolder, result: TrackingResult) -> None:
+    """Write what a tracker found; the folder is that of a run that is not done, until its record is
+    written.
+    """
+    from ..files.trajectories import write_trajectory
+    from ..results.ownership import mark_unfinished, owned_files
+    from ..tracking.sequence import write_tracking
+
+    mark_unfinished(folder, owned_files(folder) | set(map(folder.relative, folder.tracking_files)))
+    write_tracking(folder.tracking, result)
+    write_trajectory(folder.tracked_poses, result.trajectory)
 
 
 def map_in_one_pass(
@@ -139,7 +163,10 @@ def map_in_one_pass(
             name: round(value, 4) for name, value in asdict(pipeline.follower.summary()).items()
         },
     }
-    written = (*folder.tracking_files, *keep_store(folder, store))
+    kept = remembered(
+        folder, recording[:: options.recording.every], run, store, None, pipeline.config, stop
+    )
+    written = (*folder.tracking_files, *keep_store(folder, store), *kept)
     return Mapped(pipeline, run, details, written)
 
 

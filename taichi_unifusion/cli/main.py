@@ -35,6 +35,7 @@ from .formats import ShowFormats, show_formats
 from .help_texts import few_settings, no_settings, whole_sentences, with_long_names
 from .info import Info, info
 from .interrupts import INTERRUPTED
+from .into import settings_of
 from .merge import Merge, merge
 from .mesh import ExtractMesh, extract_mesh
 from .query import Query, query
@@ -163,8 +164,13 @@ def _parse(prog: str, options: type, arguments: list[str]) -> Any:
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     finder.add_argument("--config", nargs="?")
     finder.add_argument("--fix", nargs="?")
+    finder.add_argument("--into", nargs="?")
+    finder.add_argument("--out", nargs="?")
     files = finder.parse_known_args(arguments)[0]
     settings = Config()
+    if files.into:
+        settings = settings_of(files.into)
+        arguments += [] if files.out else ["--out", files.into]
     if files.fix:
         settings = config_of(read_fix(files.fix).settings, files.fix, settings)
     if files.config:

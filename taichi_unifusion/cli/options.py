@@ -160,6 +160,10 @@ class OutputOptions:
     """Folder for the results; made where it does not exist. The results of an earlier run in it are
     replaced once this one is done, which is said; other files stay.
     """
+    into: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint=OPTIONAL)] = None
+    """Add the recording to the map of an earlier run: the camera finds its place in it, or the run ends with
+    a sentence. Results go to --out, which leaves that map as it is; without --out to DIR itself.
+    """
     overwrite: FlagCreatePairsOff[bool] = False
     """Replace files that stand in the way and that no run is known to have written."""
     resume: FlagCreatePairsOff[bool] = False

@@ -18,9 +18,18 @@ from ..datasets import Dataset
 from ..errors import InputError
 from ..geometry.gravity import Up, parse_up
 from ..tracking import check_poses, track
+from ..tracking.sequence import PosedFrames
 from .color_camera import found_color, given_color
-from .following import Mapped, in_one_pass, keep_store, map_in_one_pass, open_store
+from .following import (
+    Mapped,
+    in_one_pass,
+    keep_store,
+    keep_tracking,
+    map_in_one_pass,
+    open_store,
+)
 from .interrupts import INTERRUPTED, stop_on_signal
+from .into import Addition, check_into, maps_of, placed, remembered
 from .live import LiveOptions, reconstruct_live
 from .on_workers import check_workers, remove_shards, run_on_workers
 from .options import (
@@ -42,7 +51,6 @@ if TYPE_CHECKING:
     from ..results.record import ColorRecord, Source
     from ..results.saver import RunSaver
     from ..run_log import RunResult
-    from ..tracking.sequence import PosedFrames
     from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
@@ -75,6 +83,8 @@ class Reconstruct:
 
 def reconstruct(options: Reconstruct) -> int:
     """Frames -> maps -> mesh -> results folder."""
+    if options.live.live and options.output.into is not None:
+        raise InputError("--into: not with --live yet; record first, and add the recording")
     if options.live.live:
         return reconstruct_live(
             options.recording,
@@ -101,6 +111,7 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
             "--resume: a run that keeps windows (--keep-windows, --tracking-passes 1) cannot go on yet; leave "
             "--resume out"
         )
+    check_into(options, options.cluster.wanted)
     check_workers(
         options.cluster, encoder is not None, options.watch.view or options.watch.view_window
     )
@@ -218,13 +229,20 @@ def _mapped(
         mapped = map_in_one_pass(recording, options, folder, stop, encoder, watcher)
         frames = recording[::every]
         return mapped, frames, source_of(wanted, len(frames), color)
-    tracking, tracked, written = None, None, ()
+    tracking, tracked, written, added = None, None, (), None
     if options.poses.tracked:
         recording, tracking = _track(recording, options, folder, stop, saver)
-        tracked, written = recording.tracking.frames, folder.tracking_files
     recording, color = registered(recording, color, saver)
+    if options.output.into is not None:
+        added = placed(recording, options, stop)
+        recording, tracking = added.frames, {**(tracking or {"mode": "given"}), **added.details}
+    if options.poses.tracked:
+        assert isinstance(recording, PosedFrames)
+        tracked, written = recording.tracking.frames, folder.tracking_files
+        if added:  # else they are there already
+            keep_tracking(folder, recording.tracking)
     frames = recording[::every]
-    source = source_of(wanted, len(frames), color)
+    source = replace(source_of(wanted, len(frames), color), before=added.sources if added else ())
     saver.describe(source, tracking)
     if options.cluster.wanted:
         poses = tracked and tracked[::every]
@@ -234,7 +252,7 @@ def _mapped(
             (),
         )
     else:
-        mapped = _map(frames, options, folder, stop, encoder, watcher, saver)
+        mapped = _map(frames, options, folder, stop, encoder, watcher, saver, added)
     return replace(mapped, tracking=tracking, written=(*written, *mapped.written)), frames, source
 
 
@@ -246,15 +264,17 @@ def _map(
     encoder: ImageEncoder | None,
     watcher: Watcher,
     saver: RunSaver,
+    added: Addition | None = None,
 ) -> Mapped:
-    """Fuse frames at the poses that they have."""
+    """Fuse frames at the poses that they have, to maps that are there if they are added to some."""
     from ..pipeline import Pipeline
 
     output, store = options.output, None
-    if output.keep_windows:
-        store = open_store(folder, output, options.settings, moves=False)
-    if store is not None:
-        pipeline = Pipeline(options.settings, encoder=encoder, keep=store)
+    if output.keep_windows or (added and added.windows and not output.forget):
+        store = open_store(folder, output, options.settings, moves=False, added=added)
+    if store is not None or added:
+        maps = maps_of(options)
+        pipeline = Pipeline(options.settings, encoder=encoder, keep=store, maps=maps)
     else:
         pipeline = make_pipeline(options, encoder, folder, saver)
     with frame_progress(len(frames)) as on_frame:
@@ -265,10 +285,11 @@ def _map(
             on_frame=on_frame,
             on_step=watcher.on_step,
             on_skip=watcher.on_skip,
-            on_border=saver.at_border if store is None else None,
+            on_border=saver.at_border if store is None and not added else None,
             before=saver.resumed and saver.resumed.so_far,
         )
-    return Mapped(pipeline, run, None, keep_store(folder, store))
+    kept = remembered(folder, frames, run, store, added, pipeline.config, stop)
+    return Mapped(pipeline, run, None, (*keep_store(folder, store), *kept))
 
 
 def _report_missing(run: RunResult, frames: int) -> int:
@@ -301,12 +322,10 @@ def _track(
     """The frames with the poses that are asked for, and what to say of them in the record.
 
     All frames are tracked, whatever --every leaves for the map: small steps are easier. Poses are
-    written at once, so that they outlive whatever comes after.
+    written at once, so that they outlive whatever comes after; those of a recording that is added to a
+    map wait until its place is known.
     """
     from .. import runtime
-    from ..files.trajectories import write_trajectory
-    from ..results.ownership import mark_unfinished, owned_files
-    from ..tracking.sequence import PosedFrames, write_tracking
 
     if saver.tracked is not None:
         posed = PosedFrames(recording, saver.tracked)
@@ -326,9 +345,8 @@ def _track(
             stop=stop,
             on_frame=on_frame,
         )
-    mark_unfinished(folder, owned_files(folder) | set(map(folder.relative, folder.tracking_files)))
-    write_tracking(folder.tracking, posed.tracking)
-    write_trajectory(folder.tracked_poses, posed.tracking.trajectory)
-    if not posed.tracking.interrupted:
-        saver.save_tracking(posed.tracking)
+    if options.output.into is None:
+        keep_tracking(folder, posed.tracking)
+        if not posed.tracking.interrupted:
+            saver.save_tracking(posed.tracking)
     return posed, {"mode": poses.tracking, **posed.tracking.details}

@@ -23,6 +23,8 @@ def say_what_is_replaced(
 
     if not output.overwrite:
         check_free(folder, settings, features, tracked)
+    if output.into is not None and output.into.resolve() == folder.path.resolve():
+        return
     if earlier := describe_earlier(folder):
         logger.warning(
             "%s holds %s: this run replaces it when it is done; another --out keeps it",

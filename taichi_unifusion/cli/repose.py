@@ -71,6 +71,7 @@ def _move(folder: RunFolder, windows, poses: NewPoses, device: Device) -> Repose
     """Write maps, windows and trajectory anew."""
     from .. import runtime
     from ..files.trajectories import write_trajectory
+    from ..results.keyframes import repose_keyframes
     from ..results.reposing import repose as reposed
 
     runtime.init(device)
@@ -79,6 +80,7 @@ def _move(folder: RunFolder, windows, poses: NewPoses, device: Device) -> Repose
         for name, each in maps.maps.items():
             each.save(folder.map(name))
         write_trajectory(folder.trajectory, poses.trajectory)
+        repose_keyframes(folder, poses)
         folder.new_windows.replace(folder.windows)
     finally:
         folder.new_windows.unlink(missing_ok=True)

@@ -32,6 +32,7 @@ _MARK = b"REC1"
 MAX_HEADER, MAX_BODY = 64 << 20, 1 << 34  # [bytes]
 MAX_ELEMENTS = 1 << 34
 DTYPES = ("bool", "int8", "uint8", "int16", "uint16", "int32", "int64", "float32", "float64")
+PNG_DTYPES = ("uint8", "uint16")  # of stacks of images
 ZLIB_LEVEL = 1  # 6 takes four times as long and saves a tenth
 Coder = tuple[Callable[[NDArray], bytes], Callable[[bytes, np.dtype, tuple[int, ...]], NDArray]]
 
@@ -70,7 +71,8 @@ def pack(values: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> bytes:
     entries, parts = [], []
     for name, array in arrays.items():
         array = np.ascontiguousarray(array)
-        coding = "png" if array.dtype == np.uint16 and array.ndim == 3 and array.size else "zlib"
+        image = array.dtype.name in PNG_DTYPES and array.ndim == 3 and array.size
+        coding = "png" if image else "zlib"
         parts.append(_CODERS[coding][0](array))
         entries.append(
             {

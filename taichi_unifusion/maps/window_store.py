@@ -43,6 +43,7 @@ class WindowStore:
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path
+        self.first = 0  # added to the places of frames of windows that come from now on
         self.windows: list[Kept] = []
         self._log = None if path is None else RecordLog(path)
         self._packer = ThreadPoolExecutor(1, "packs windows")
@@ -66,6 +67,8 @@ class WindowStore:
 
     def __call__(self, window: KeptWindow) -> None:
         """Keep a window that was fused where it lies."""
+        if self.first:
+            window = replace(window, frames=tuple(self.first + i for i in window.frames))
         values, arrays = to_record(window)
         self.windows.append(
             Kept(

@@ -76,7 +76,11 @@ def read_new_poses(folder: RunFolder, file: Path) -> NewPoses:
     Raises InputError where it has none for any of them, DatasetError or FileError where it cannot
     be read.
     """
-    run, before, found = read_run(folder.path), None, read_poses(file)
+    run, found = read_run(folder.path), read_poses(file)
+    if run.source.before:
+        raise InputError(
+            f"{folder.path}: holds {1 + len(run.source.before)} recordings; move the map of each, before they are added"
+        )
     before = run.trajectory()
     frames = np.array(run.used)
     keys = before.timestamps if found.by_time else frames.astype(np.float64)

@@ -53,6 +53,16 @@ class RunFolder:
         return self.path / ".windows.log.tmp"
 
     @property
+    def keyframes(self) -> Path:
+        """What a camera that comes back another day finds its place by."""
+        return self.path / "keyframes.log"
+
+    @property
+    def new_keyframes(self) -> Path:
+        """The same of a run that is not done."""
+        return self.path / ".keyframes.log.tmp"
+
+    @property
     def color_camera(self) -> Path:
         """The colour camera that images were registered with, where there is one."""
         return self.path / "color_camera.yaml"
@@ -260,7 +270,7 @@ class RunFolder:
         if len(path.parts) == 2:
             return self.path / path == self.map(path.stem)
         fixed = (self.record, self.config, self.trajectory, self.color_camera, self.answers)
-        fixed = (*fixed, self.windows)
+        fixed = (*fixed, self.windows, self.keyframes)
         fixed = {file.name for file in (*fixed, *self.tracking_files, *self.segmentation_files)}
         return name in fixed or path.suffix[1:] in (*MESH_SUFFIXES, "png")
 

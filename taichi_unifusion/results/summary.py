@@ -73,6 +73,8 @@ def count_frames(frames: FrameCounts) -> str:
 
 def describe_origin(record: RunRecord) -> str:
     """Where x = y = z = 0 is, and which way the axes point."""
+    if record.tracking and "joined" in record.tracking:
+        return f"that of {record.tracking['joined']['into']}, to which the recording was added"
     if record.tracking and record.tracking.get("mode") == "rgbd":
         return "the first camera: x to its right, y down, z forwards"
     return "where the poses of the recording have it"
@@ -94,8 +96,17 @@ def tracking_lines(tracking: Mapping[str, Any] | None) -> list[str]:
     """How the poses were found, where they were."""
     if not tracking:
         return []
+    joined = tracking.get("joined")
+    added = (
+        [f"added    to {joined['into']}: {joined['said']}"]  # where the camera found its place
+        if joined
+        else []
+    )
+    if "verdicts" not in tracking:
+        return added
     counts = ", ".join(f"{count} {verdict}" for verdict, count in tracking["verdicts"].items())
     found = [f"{tracking[name]} {name}" for name in ("keyframes", "loops") if name in tracking]
     return [
-        f"tracking {tracking['mode']}: {counts}{'; ' if found else ''}{', '.join(found)} ({tracking['seconds']:.1f} s)"
+        f"tracking {tracking['mode']}: {counts}{'; ' if found else ''}{', '.join(found)} ({tracking['seconds']:.1f} s)",
+        *added,
     ]

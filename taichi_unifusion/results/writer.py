@@ -94,7 +94,7 @@ def write_results(
     folder, started = prepare_results(directory), time.perf_counter()
     folder.map_folder.mkdir(exist_ok=True)
     writer = FolderWriter.marking(folder, written)
-    for file in (*folder.tracking_files, folder.windows):
+    for file in (*folder.tracking_files, folder.windows, folder.keyframes):
         if file not in written:
             writer.remove(file)
     logger.info("writing to %s", folder.path)

@@ -58,9 +58,14 @@ class Keyframes:
 
     def add(self, keyframe: Keyframe, pyramid: SurfelPyramid, T_world_keyframe: NDArray) -> int:
         """Keep a keyframe; returns its number."""
+        number = self.append(keyframe, T_world_keyframe)
+        self._remember(number, pyramid)
+        return number
+
+    def append(self, keyframe: Keyframe, T_world_keyframe: NDArray) -> int:
+        """Keep a keyframe whose pyramid is built when it is asked for; returns its number."""
         self.items.append(keyframe)
         self.T_world_keyframe.append(T_world_keyframe)
-        self._remember(len(self.items) - 1, pyramid)
         return len(self.items) - 1
 
     def pyramid(self, number: int) -> SurfelPyramid:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -19,7 +19,7 @@ from ..datasets.loading import index_in_recording, load_ahead
 from ..errors import FrameError, PoseError
 from ..files.atomic import write_text
 from ..types import Frame
-from .base import Tracker, TrackingResult, Verdict
+from .base import TrackedFrame, Tracker, TrackingResult, Verdict
 from .external import runs
 
 if TYPE_CHECKING:
@@ -138,6 +138,18 @@ class PosedFrames(DatasetView):
         return super().with_color_camera(
             camera, self.velocities() if velocities is None else velocities
         )
+
+
+def with_poses(frames: Dataset, T_world_camera: Mapping[int, NDArray[np.float64]]) -> PosedFrames:
+    """Frames with these poses, by place in the recording; those of others are missing."""
+    tracked = []
+    for i in range(len(frames)):
+        place = index_in_recording(frames, i)
+        T, timestamp = T_world_camera.get(place), frames.pose_at(i)[0]
+        verdict = Verdict.MISSING if T is None else Verdict.GIVEN
+        message = "no pose is known" if T is None else ""
+        tracked.append(TrackedFrame(place, verdict, T, timestamp, message=message))
+    return PosedFrames(frames, TrackingResult(tuple(tracked)))
 
 
 def write_tracking(path: Path, result: TrackingResult) -> None:

@@ -1,0 +1,223 @@
+"""`--into DIR`: a new recording is added to the map of an earlier run, whose world it joins."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..config import Config, load_config
+from ..datasets import Dataset
+from ..datasets.loading import index_in_recording
+from ..errors import FileError, InputError
+from .options import RunOptions
+
+if TYPE_CHECKING:
+    from ..maps import BaseMap
+    from ..maps.window_store import WindowStore
+    from ..results import RunFolder
+    from ..results.record import Source
+    from ..run_log import RunResult
+    from ..tracking.joining import Joined
+    from ..tracking.keyframes import Keyframes
+    from ..tracking.sequence import PosedFrames
+
+logger = logging.getLogger(__name__)
+MAPS = (
+    "voxel_size",
+    "surface",
+    "color",
+    "property_map",
+    "feature_map",
+    "properties",
+)  # settings that stay
+POSED = ("given", "external")  # poses that stay as they are relative to each other
+
+
+@dataclass(frozen=True, eq=False)
+class Addition:
+    """A recording in the world of the map that it is added to."""
+
+    frames: PosedFrames
+    keyframes: Keyframes  # of the map, and of the recording
+    details: dict[str, Any]  # for the record
+    sources: tuple[Source, ...]  # what the map was made from, in order
+    windows: Path | None  # what its windows were fused from, if that was kept
+
+
+def check_into(options: RunOptions, on_workers: bool) -> None:
+    """Raise InputError for options that --into does not go with, FileError where there is no map."""
+    from ..results.reader import read_run
+    from ..results.run_folder import RunFolder
+
+    output, into = options.output, options.output.into
+    if into is None:
+        return
+    if output.resume or on_workers:
+        other = "--resume" if output.resume else "several workers"
+        raise InputError(f"--into: does not go with {other} yet; leave it out")
+    known = RunFolder(into)
+    before = read_run(into).config()
+    if before.map_memory or options.settings.map_memory:
+        raise InputError(
+            f"--into: {into} holds maps in tiles (map_memory), which cannot be added to yet"
+        )
+    for name in MAPS:
+        if getattr(options.settings, name) != getattr(before, name):
+            raise InputError(
+                f"--into: settings of maps stay those of {into}, and '{name}' is another one here; leave it out"
+            )
+    if output.keep_windows and not known.windows.exists():
+        raise InputError(
+            f"--keep-windows: {into} holds no {known.windows.name}, so that of both would lack what it was made "
+            "from; leave it out"
+        )
+
+
+def settings_of(into: str | Path) -> Config:
+    """The settings of the run that a recording is added to."""
+    from ..results.run_folder import RunFolder
+
+    file = RunFolder(Path(into)).config
+    if not file.exists():
+        raise FileError(
+            f"{into}: holds no {file.name}; give --into the results of `unifusion reconstruct`"
+        )
+    return load_config(file)
+
+
+def maps_of(options: RunOptions) -> dict[str, BaseMap]:
+    """The maps that a recording is added to; none without --into. Starts Taichi."""
+    from .. import runtime
+    from ..maps import load_map
+    from ..results.run_folder import RunFolder
+
+    if options.output.into is None:
+        return {}
+    runtime.init(options.settings.device, threads=options.settings.threads or None)
+    return {name: load_map(path) for name, path in RunFolder(options.output.into).maps.items()}
+
+
+def begin_windows(folder: RunFolder, known: Path) -> WindowStore:
+    """A file of windows that begins with those of the map; frames are counted on from theirs."""
+    from ..maps.window_store import WindowStore
+
+    try:
+        shutil.copyfile(known, folder.new_windows)
+    except OSError as error:
+        raise FileError(f"{folder.new_windows}: cannot be written: {error}") from None
+    store = WindowStore(folder.new_windows)
+    store.first = 1 + max((max(kept.frames) for kept in store.windows), default=-1)
+    return store
+
+
+def remembered(
+    folder: RunFolder,
+    frames: Dataset,
+    run: RunResult,
+    store: WindowStore | None,
+    added: Addition | None,
+    config: Config,
+    stop: Callable[[], bool],
+) -> tuple[Path, ...]:
+    """Keep the keyframes of a run that keeps its windows, and of one that was added to a map; the
+    files that are there then.
+    """
+    from ..results.keyframes import keyframes_of_run
+    from ..tracking.keyframe_file import write_keyframes
+
+    in_file = store is not None and store.path is not None
+    if not run.steps or not (in_file or added):
+        return ()
+    found = added.keyframes if added else keyframes_of_run(frames, run, config, stop)
+    size = write_keyframes(folder.new_keyframes, found)
+    folder.new_keyframes.replace(folder.keyframes)
+    logger.info(
+        "%d keyframes kept, %.1f MB: --into finds its place by them", len(found), size / 1e6
+    )
+    return (folder.keyframes,)
+
+
+def placed(recording: Dataset, options: RunOptions, stop: Callable[[], bool]) -> Addition:
+    """The recording, which has poses, in the world of the map; raises NoOverlap where its place is
+    not sure.
+    """
+    from .. import runtime
+    from ..results.keyframes import depth_range, known_keyframes
+    from ..results.reader import read_run
+    from ..results.run_folder import RunFolder
+    from ..tracking.joining import join, keyframes_of
+
+    assert options.output.into is not None
+    settings = options.settings
+    runtime.init(settings.device, threads=settings.threads or None)
+    known = known_keyframes(RunFolder(options.output.into))
+    new = keyframes_of(recording, depth_range(settings), stop)
+    logger.info("looking for the place of %d views among %d of the map", len(new), len(known))
+    joined = join(
+        known,
+        new,
+        settings.tracking.photometric_weight,
+        rigid=options.poses.tracking in POSED,
+    )
+    logger.info("%s", sentence(joined, len(new)))
+    frames = moved(recording, new, joined)
+    for keyframe, T in zip(new.items, joined.T_known_keyframe, strict=True):
+        known.append(keyframe, T)
+    folder = RunFolder(options.output.into)
+    source = read_run(folder.path).source
+    return Addition(
+        frames,
+        known,
+        {"joined": details_of(joined, folder.path, len(new))},
+        (*source.before, replace(source, before=())),
+        folder.windows if folder.windows.exists() else None,
+    )
+
+
+def sentence(joined: Joined, views: int) -> str:
+    """What was found, to say."""
+    return (
+        f"{joined.matched} of {views} views were recognised, {joined.aligned} pairs aligned: "
+        f"{joined.agreement:.0%} of what both see agrees; poses were bent by up to {100 * joined.bent:.1f} cm"
+    )
+
+
+def details_of(joined: Joined, into: Path, views: int) -> dict[str, Any]:
+    """What the record keeps of it."""
+    return {
+        "into": str(into),
+        "said": sentence(joined, views),
+        "recognised": joined.matched,
+        "aligned": joined.aligned,
+        "agreement": round(joined.agreement, 4),
+        "bent": round(joined.bent, 5),
+        "T_map_recording": joined.T_known_new.tolist(),
+    }
+
+
+def moved(recording: Dataset, new: Keyframes, joined: Joined) -> PosedFrames:
+    """The frames at their new poses: each moves with the keyframe before it."""
+    from ..geometry import se3
+    from ..tracking.sequence import PosedFrames, with_poses
+
+    before, after = np.array(new.T_world_keyframe), joined.T_known_keyframe
+    motion = after @ se3.inverse(before)
+    starts = np.array([keyframe.index for keyframe in new.items])
+    poses = {}
+    for i in range(len(recording)):
+        place, T = index_in_recording(recording, i), recording.pose_at(i)[1]
+        if T is not None and np.isfinite(T).all():
+            row = max(int(np.searchsorted(starts, place, "right")) - 1, 0)
+            poses[place] = se3.normalized(motion[row] @ T)
+    there = with_poses(recording, poses)
+    if not isinstance(recording, PosedFrames):
+        return there
+    found = zip(recording.tracking.frames, there.tracking.frames, strict=True)
+    frames = tuple(replace(was, T_world_camera=now.T_world_camera) for was, now in found)
+    return PosedFrames(recording, replace(recording.tracking, frames=frames))

@@ -1,0 +1,119 @@
+"""`unifusion reconstruct --into`: a recording of another day, in a world of its own, joins a map."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from taichi_unifusion.cli.main import main
+from taichi_unifusion.datasets.synthetic import SyntheticRoom
+from taichi_unifusion.files.mesh_reading import read_mesh
+from taichi_unifusion.files.trajectories import read_trajectory
+from taichi_unifusion.geometry import se3
+from taichi_unifusion.maps.window_store import WindowStore
+from taichi_unifusion.results.run_folder import RunFolder
+from taichi_unifusion.tracking.keyframe_file import read_keyframes
+
+ROOM = ["synthetic", "--option", "frames=120", "--option", "width=240", "--option", "height=180"]
+SMALL = ["--voxel-size", "0.1", "--window", "4", "--device", "cpu", "--color-camera", "none"]
+OFF = 0.002, 0.1  # [m, degrees] of a camera that found its place; 0.3 mm and 0.01 degrees are usual
+APART = 0.002  # [m] between surfaces, in the mean
+
+
+def reconstruct(*words: str, start: int = 0, end: int) -> int:
+    return main(["reconstruct", *ROOM, "--start", str(start), "--end", str(end), *words])
+
+
+@pytest.fixture(scope="module")
+def monday(tmp_path_factory):
+    """The map of the first frames, with its windows."""
+    folder = tmp_path_factory.mktemp("monday") / "results"
+    assert reconstruct(*SMALL, "--keep-windows", "--out", str(folder), end=14) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def both(monday, tmp_path_factory):
+    """With frames of a second recording, whose world begins at its first camera."""
+    folder = tmp_path_factory.mktemp("both") / "results"
+    words = ["--tracking", "rgbd", "--into", str(monday), "--out", str(folder)]
+    assert reconstruct(*words, start=8, end=24) == 0
+    return folder
+
+
+def test_the_camera_finds_its_place(both):
+    found = read_trajectory(both / "trajectory.txt").T_world_camera
+    truth = SyntheticRoom(frames=120).T_world_camera[8:24]
+    off = np.array([se3.distance(a, b) for a, b in zip(found, truth, strict=True)])
+    assert off[:, 0].max() < OFF[0] and np.degrees(off[:, 1].max()) < OFF[1]
+    tracked = read_trajectory(both / "tracking.txt").T_world_camera
+    np.testing.assert_allclose(tracked, found, atol=1e-6)
+
+
+def test_the_map_is_that_of_both_recordings(both, tmp_path):
+    # frames 8 to 13 were seen twice
+    assert reconstruct(*SMALL, "--out", str(tmp_path), end=24) == 0
+    ours, theirs = (cKDTree(read_mesh(f / "mesh.ply").vertices) for f in (both, tmp_path))
+    for a, b in ((ours, theirs), (theirs, ours)):
+        distance = a.query(b.data)[0]
+        assert np.median(distance) < APART and np.mean(distance < 0.02) > 0.99
+
+
+def test_what_a_map_was_made_from_is_kept(both, monday):
+    before, after = RunFolder(monday), RunFolder(both)
+    source = json.loads(after.record.read_text())["recording"]
+    assert [each["start"] for each in source["before"]] == [0] and source["start"] == 8
+    first, all_ = WindowStore.open(before.windows), WindowStore.open(after.windows)
+    assert len(all_) == len(first) + 4
+    places = [place for kept in all_.windows for place in kept.frames]
+    assert places == list(range(14)) + list(range(14 + 8, 14 + 24))
+    ours = read_keyframes(after.keyframes)
+    assert len(ours) > len(read_keyframes(before.keyframes)) > 2
+
+
+def test_a_map_is_added_to_in_place_again_and_again(tmp_path, capsys):
+    """Without keyframes: they are taken from the recording that is still there."""
+    folder = tmp_path / "results"
+    assert reconstruct(*SMALL, "--out", str(folder), end=6) == 0
+    voxels = []
+    for start in (3, 7):
+        assert reconstruct("--into", str(folder), start=start, end=start + 6) == 0
+        record = json.loads((folder / "metrics.json").read_text())
+        voxels.append(record["maps"]["surface"]["voxels"])
+        assert "added    to" in capsys.readouterr().out
+    assert voxels[1] > voxels[0] and len(record["recording"]["before"]) == 2
+    assert record["tracking"]["joined"]["recognised"] >= 2
+    T = np.array(record["tracking"]["joined"]["T_map_recording"])
+    assert se3.distance(np.eye(4), T)[0] < OFF[0]  # the same world
+    assert (folder / "keyframes.log").exists() and not (folder / "windows.log").exists()
+    t = folder / "trajectory.txt"
+    assert main(["repose", str(folder), "--trajectory", str(t)]) == 2  # no windows
+
+
+def test_a_recording_of_another_place_leaves_the_map_as_it_is(monday, capsys):
+    before = {file.name: file.read_bytes() for file in monday.iterdir() if file.is_file()}
+    assert reconstruct("--tracking", "rgbd", "--into", str(monday), start=70, end=76) == 2
+    assert "does not find its place" in capsys.readouterr().err
+    assert before == {file.name: file.read_bytes() for file in monday.iterdir() if file.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--voxel-size", "0.2"], "'voxel_size' is another one"),
+        (["--resume"], "--resume"),
+        (["--live"], "--live"),
+        (["--map-memory", "1GB"], "tiles"),
+    ],
+)
+def test_what_does_not_go_with_it_is_said(monday, capsys, words, message):
+    assert reconstruct("--into", str(monday), *words, end=8) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_folder_without_results_is_named(tmp_path, capsys):
+    assert reconstruct("--into", str(tmp_path / "none"), end=8) == 2
+    assert "config.yaml" in capsys.readouterr().err
