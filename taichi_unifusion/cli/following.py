@@ -13,7 +13,7 @@ from ..config import Config
 from ..datasets import Dataset
 from ..types import Trajectory
 from .color_camera import AUTO
-from .into import Addition, begin_windows, remembered
+from .into import Addition, remembered
 from .options import OutputOptions, RunOptions
 from .terminal import frame_progress
 
@@ -85,7 +85,9 @@ def open_store(
         return WindowStore() if moves else None
     folder.new_windows.unlink(missing_ok=True)
     if added and added.windows:
-        return begin_windows(folder, added.windows)
+        from ..results.merging import continued
+
+        return continued(added.windows, folder)
     return WindowStore(folder.new_windows)
 
 

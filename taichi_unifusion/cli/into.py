@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,14 +27,6 @@ if TYPE_CHECKING:
     from ..tracking.sequence import PosedFrames
 
 logger = logging.getLogger(__name__)
-MAPS = (
-    "voxel_size",
-    "surface",
-    "color",
-    "property_map",
-    "feature_map",
-    "properties",
-)  # settings that stay
 POSED = ("given", "external")  # poses that stay as they are relative to each other
 
 
@@ -52,6 +43,7 @@ class Addition:
 
 def check_into(options: RunOptions, on_workers: bool) -> None:
     """Raise InputError for options that --into does not go with, FileError where there is no map."""
+    from ..results.merging import SETTINGS
     from ..results.reader import read_run
     from ..results.run_folder import RunFolder
 
@@ -67,7 +59,7 @@ def check_into(options: RunOptions, on_workers: bool) -> None:
         raise InputError(
             f"--into: {into} holds maps in tiles (map_memory), which cannot be added to yet"
         )
-    for name in MAPS:
+    for name in SETTINGS:
         if getattr(options.settings, name) != getattr(before, name):
             raise InputError(
                 f"--into: settings of maps stay those of {into}, and '{name}' is another one here; leave it out"
@@ -101,19 +93,6 @@ def maps_of(options: RunOptions) -> dict[str, BaseMap]:
         return {}
     runtime.init(options.settings.device, threads=options.settings.threads or None)
     return {name: load_map(path) for name, path in RunFolder(options.output.into).maps.items()}
-
-
-def begin_windows(folder: RunFolder, known: Path) -> WindowStore:
-    """A file of windows that begins with those of the map; frames are counted on from theirs."""
-    from ..maps.window_store import WindowStore
-
-    try:
-        shutil.copyfile(known, folder.new_windows)
-    except OSError as error:
-        raise FileError(f"{folder.new_windows}: cannot be written: {error}") from None
-    store = WindowStore(folder.new_windows)
-    store.first = 1 + max((max(kept.frames) for kept in store.windows), default=-1)
-    return store
 
 
 def remembered(

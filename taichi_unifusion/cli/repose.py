@@ -53,10 +53,10 @@ def repose(options: Repose) -> int:
     poses = read_new_poses(folder, options.trajectory)
     target = folder
     if options.out is not None and options.out.resolve() != options.dir.resolve():
-        target = _copied(folder, options.out)
+        target = copied(folder, options.out)
     with lock_folder(target):
         moved = _move(target, windows, poses, options.device)
-    resolution, min_area = _mesh_settings(target)
+    resolution, min_area = mesh_settings(target)
     print(
         f"{target.path}: {moved.moved} of {moved.windows} windows moved, by {100 * moved.median:.1f} cm in the "
         f"median and up to {100 * moved.farthest:.1f} cm; {poses.given} of {len(poses.by_frame)} frames have a "
@@ -89,7 +89,7 @@ def _move(folder: RunFolder, windows, poses: NewPoses, device: Device) -> Repose
     return moved
 
 
-def _copied(folder: RunFolder, out: Path) -> RunFolder:
+def copied(folder: RunFolder, out: Path) -> RunFolder:
     """A copy of a results folder; raises FileError where something is there already."""
     if out.exists() and any(out.iterdir()):
         raise FileError(f"{out}: is there already; give --out a folder that is new")
@@ -102,7 +102,7 @@ def _copied(folder: RunFolder, out: Path) -> RunFolder:
     return RunFolder(out)
 
 
-def _mesh_settings(folder: RunFolder) -> tuple[int, float]:
+def mesh_settings(folder: RunFolder) -> tuple[int, float]:
     """Resolution and smallest part of the mesh, as the run had them."""
     from ..config import load_config
 

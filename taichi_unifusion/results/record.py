@@ -43,7 +43,9 @@ class Source:
     reading: Mapping[str, Any] = field(default_factory=dict)
     frames: int  # how many these are
     color: ColorRecord | None = None  # None: as the recording gives it
-    before: tuple[Source, ...] = ()  # that the map held already when this one was added to it
+    before: tuple[
+        Source, ...
+    ] = ()  # others that the map is made from: it was added to them, or merged
 
     @property
     def asked(self) -> range:

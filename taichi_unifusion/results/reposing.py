@@ -48,11 +48,15 @@ class Reposed:
 
 
 class Refusing:
-    """Empty maps as those of a run, without what made their values: windows are fused into them."""
+    """Maps of a run, without what made their values, `empty` or as they are: windows are fused into
+    them.
+    """
 
-    def __init__(self, folder: RunFolder) -> None:
+    def __init__(self, folder: RunFolder, *, empty: bool = True) -> None:
         loaded = [load_map(path) for path in folder.maps.values()]
-        self.maps: dict[str, BaseMap] = {each.name: each.emptied() for each in loaded}
+        self.maps: dict[str, BaseMap] = {
+            each.name: each.emptied() if empty else each for each in loaded
+        }
         self.groups: list[MapGroup] = group_maps(self.maps.values())
         self.fusion = WindowFusion(1)
 

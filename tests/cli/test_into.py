@@ -44,6 +44,23 @@ def both(monday, tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def of_both(tmp_path_factory):
+    """The map of all frames at their true poses; those from 8 to 13 are in both recordings."""
+    folder = tmp_path_factory.mktemp("all") / "results"
+    assert reconstruct(*SMALL, "--out", str(folder), end=24) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tuesday(tmp_path_factory):
+    """The second recording by itself, in its own world."""
+    folder = tmp_path_factory.mktemp("tuesday") / "results"
+    words = [*SMALL, "--tracking", "rgbd", "--tracking-passes", "1", "--out", str(folder)]
+    assert reconstruct(*words, start=8, end=24) == 0
+    return folder
+
+
 def test_the_camera_finds_its_place(both):
     found = read_trajectory(both / "trajectory.txt").T_world_camera
     truth = SyntheticRoom(frames=120).T_world_camera[8:24]
@@ -53,13 +70,15 @@ def test_the_camera_finds_its_place(both):
     np.testing.assert_allclose(tracked, found, atol=1e-6)
 
 
-def test_the_map_is_that_of_both_recordings(both, tmp_path):
-    # frames 8 to 13 were seen twice
-    assert reconstruct(*SMALL, "--out", str(tmp_path), end=24) == 0
-    ours, theirs = (cKDTree(read_mesh(f / "mesh.ply").vertices) for f in (both, tmp_path))
+def assert_same_surface(folder, other):
+    ours, theirs = (cKDTree(read_mesh(f / "mesh.ply").vertices) for f in (folder, other))
     for a, b in ((ours, theirs), (theirs, ours)):
         distance = a.query(b.data)[0]
         assert np.median(distance) < APART and np.mean(distance < 0.02) > 0.99
+
+
+def test_the_map_is_that_of_both_recordings(both, of_both):
+    assert_same_surface(both, of_both)
 
 
 def test_what_a_map_was_made_from_is_kept(both, monday):
@@ -72,6 +91,28 @@ def test_what_a_map_was_made_from_is_kept(both, monday):
     assert places == list(range(14)) + list(range(14 + 8, 14 + 24))
     ours = read_keyframes(after.keyframes)
     assert len(ours) > len(read_keyframes(before.keyframes)) > 2
+
+
+def test_two_results_become_one_in_the_world_of_the_first(
+    monday, tuesday, of_both, tmp_path, capsys
+):
+    out = tmp_path / "merged"
+    assert main(["merge", str(monday), str(tuesday), "--align", "--out", str(out)]) == 0
+    assert "views were recognised" in capsys.readouterr().out
+    assert_same_surface(out, of_both)
+    record = json.loads((out / "metrics.json").read_text())
+    assert record["recording"]["start"] == 0 and record["recording"]["before"][0]["start"] == 8
+    assert len(WindowStore.open(out / "windows.log")) == 4 + 4
+    assert main(["info", str(out)]) == 0
+    # what was merged is a map like others: a third recording joins it
+    words = ["--into", str(out), "--out", str(tmp_path / "three")]
+    assert reconstruct(*words, start=20, end=26) == 0
+
+
+def test_worlds_that_are_not_the_same_are_not_added_up(monday, tuesday, tmp_path, capsys):
+    out = str(tmp_path / "merged")
+    assert main(["merge", str(monday), str(tuesday), "--out", out]) == 2
+    assert "--align" in capsys.readouterr().err
 
 
 def test_a_map_is_added_to_in_place_again_and_again(tmp_path, capsys):
