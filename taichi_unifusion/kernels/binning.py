@@ -55,7 +55,7 @@ def bin_points(
                 at = ti.floor(x, ti.i32)
                 if any(at != place):  # a run of points in one cell costs one write
                     if run > 0:
-                        add_run(width, b, place, run, total, 1, sums)
+                        add_run(width, b, cell_in_lattice(place), run, total, 1, sums)
                     if any((at >> 2) != (place >> 2)):
                         b = block_in(index, at >> 2)
                         mark_frame(b, frame, 1, keys)
@@ -72,7 +72,7 @@ def bin_points(
                     for d in ti.static(range(3)):
                         total[width - 3 + d] += (x[d] - at[d] - 0.5) / CELLS * weight
         if run > 0:
-            add_run(width, b, place, run, total, 1, sums)
+            add_run(width, b, cell_in_lattice(place), run, total, 1, sums)
 
 
 @ti.func
@@ -80,7 +80,7 @@ def add_run(
     # in:
     width: ti.template(),
     b: ti.i32,
-    place: ti.template(),
+    cell: ti.i32,
     run: ti.i32,
     total: ti.template(),
     sign: ti.i32,
@@ -88,7 +88,6 @@ def add_run(
     sums: ti.template(),
 ):
     """Add the sums over a run of points to their cell; with sign -1 take them back."""
-    cell = cell_in_lattice(place)
     ti.atomic_add(sums[b, cell, 0], ti.cast(sign * run, ti.i64))
     for c in ti.static(range(width)):
         # rounded so: `round` is a call of a function on the CPU

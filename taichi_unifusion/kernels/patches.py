@@ -13,14 +13,12 @@ import taichi as ti
 
 from ..runtime import DeviceArray
 from .arrays import Bytes3, Floats2, Floats3, Ints1, Ints2, Sums3
-from .binning import add_run, mark_frame
 from .camera import Intrinsics, Pose, lift, move, ray, rotate
-from .cells import CELLS
 from .images import inverse_depth_slope, segment, segments
-from .index import INDEX_HALF, Index
+from .index import Index
+from .patch_cells import QUAD, add_colors, add_surfels, ask_ahead, find_cells, patch_color
 from .tasks import small_stride
 
-QUAD = 4  # pixels, at most as many patches
 IS_NUMBER = 0x7F800000  # bits of a float, without its sign, below this
 
 
@@ -116,7 +114,7 @@ class Patches:
 
 def quads_of_run() -> int:
     """Quads of a row that one task takes: few enough on the CPU to share a frame out evenly."""
-    return 20 if ti.lang.impl.current_cfg().arch in (ti.x64, ti.arm64) else 1
+    return 40 if ti.lang.impl.current_cfg().arch in (ti.x64, ti.arm64) else 1
 
 
 def slots_of_run() -> int:
@@ -154,91 +152,6 @@ def clip_and_invert(
             inverse[v, u] = 1.0 / z if known and z <= depth_max else 0.0
 
 
-@ti.func
-def claim_block(
-    # in:
-    ijk: ti.template(),
-    stamp: ti.i32,
-    which: ti.template(),
-    first: ti.i32,
-    index: ti.template(),
-    room: ti.i32,
-    # in and out:
-    totals: ti.template(),
-    keys: ti.template(),
-) -> ti.i32:
-    """The block of voxel ijk, numbered by the first who asks; others wait until it says so.
-
-    Blocks beyond the room in the arrays are counted only; they get their keys when the frame is gone
-    through again, for blocks from `first` on.
-    """
-    at = ijk + INDEX_HALF
-    b = index.block[at]
-    if b == 0:
-        if ti.atomic_max(index.stamp[at], stamp) != stamp:
-            b = ti.atomic_add(totals[which], 1) + 1
-            if b <= room:
-                for d in ti.static(range(3)):
-                    keys[b - 1, d] = ijk[d]
-            ti.atomic_add(index.block[at], b)
-        else:
-            while b == 0:
-                b = ti.atomic_add(index.block[at], 0)  # a plain read would be moved out of the loop
-    elif first > 0 and b > first:
-        for d in ti.static(range(3)):
-            keys[b - 1, d] = ijk[d]
-    return b - 1
-
-
-@ti.func
-def enter_voxel(
-    # in:
-    ijk: ti.template(),
-    which: ti.template(),
-    now: ti.template(),
-    index: ti.template(),
-    # in and out:
-    totals: ti.template(),
-    keys: ti.template(),
-    sums: ti.template(),
-) -> ti.i32:
-    """The block of voxel ijk in the cells of map `which` of 2, 3, marked as seen by the frame."""
-    room = sums.shape[0]
-    block = claim_block(ijk, now[which], which, now[which + 2], index, room, totals, keys)
-    if block < room:
-        mark_frame(block, 1 << now[1], now[0], keys)
-    return block
-
-
-@ti.func
-def end_run(
-    # in:
-    width: ti.template(),
-    which: ti.template(),
-    block: ti.i32,
-    place: ti.template(),
-    run: ti.i32,
-    total: ti.template(),
-    now: ti.template(),
-    # in and out:
-    sums: ti.template(),
-):
-    """Add the sums over a run of patches in a cell, if blocks from this one on are added to."""
-    if run > 0 and block >= now[which + 2]:
-        add_run(width, block, place, run, total, now[0], sums)
-
-
-@ti.func
-def patch_color(color: ti.template(), row: ti.i32, column: ti.i32, mask: ti.i32, count: ti.i32):
-    """Mean colour, in [0, 1], of the pixels of a quad whose bits are in `mask`."""
-    total = ti.Vector([0, 0, 0])
-    for p in range(QUAD):
-        if (mask >> p) & 1 != 0:
-            for c in ti.static(range(3)):
-                total[c] += ti.cast(color[row + p // 2, column + p % 2, c], ti.i32)
-    return ti.cast(total, ti.f32) * (1.0 / (255.0 * ti.cast(count, ti.f32)))
-
-
 @ti.kernel
 def make_patches(
     # in:
@@ -260,7 +173,7 @@ def make_patches(
     patches: PatchPack,
 ):
     height, width = inverse.shape[0], inverse.shape[1]
-    quads = ti.static(quads_of_run())
+    quads, slots = ti.static(quads_of_run(), slots_of_run())
     across = (width + 1) // 2
     runs = (across + quads - 1) // quads
     jump, cos_max_angle, least = rules[0], rules[1], rules[2]
@@ -269,12 +182,10 @@ def make_patches(
         if i % stride == 0:
             part = i // stride
             row, start = part // runs, part % runs * quads
-            n, pixels = part * ti.static(slots_of_run()), 0
-            # runs of patches in one cell, of the surface and of the colours: a run costs one write
-            place_s = ti.Vector([INDEX_HALF * CELLS, 0, 0])
-            place_c = ti.Vector([INDEX_HALF * CELLS, 0, 0])
-            block_s, block_c, run_s, run_c = 0, 0, 0, 0
-            total_s, total_c = ti.Vector([0.0] * 6), ti.Vector([0.0] * 3)
+            n, pixels = 0, 0
+            # the patches of the run
+            middles, facing = ti.Vector([0.0] * (3 * slots)), ti.Vector([0.0] * (3 * slots))
+            sizes, marks = ti.Vector([0] * slots), ti.Vector([0] * slots)
             for column in range(start, ti.min(start + quads, across)):
                 # slopes of a surface, and its inverse depth
                 slope_u, slope_v, of, known = 0.0, 0.0, 0.0, False
@@ -290,59 +201,11 @@ def make_patches(
                     other = ti.abs(q - of) > 0.5 * jump * q
                     if count > 0:
                         if p == QUAD or (q > 0 and (other or q < least)):
-                            weight = ti.cast(count, ti.f32)
-                            x = move(T_world_camera, x / weight)
-                            if ti.static(sinks.write):
-                                for d in ti.static(range(3)):
-                                    patches.points[n, d], patches.normals[n, d] = x[d], normal[d]
-                                patches.counts[n] = count
-                                patches.places[n] = (row * across + column) * 16 + mask
-                            if ti.static(sinks.has_surface):
-                                y = x * ti.static(sinks.surface.per_meter * CELLS)
-                                at = ti.floor(y, ti.i32)
-                                if any(at != place_s):
-                                    end_run(6, 2, block_s, place_s, run_s, total_s, now, sums_s)
-                                    if any((at >> 2) != (place_s >> 2)):
-                                        block_s = enter_voxel(
-                                            at >> 2,
-                                            2,
-                                            now,
-                                            sinks.surface.index,
-                                            totals,
-                                            keys_s,
-                                            sums_s,
-                                        )
-                                    place_s = at
-                                    run_s = 0
-                                    total_s.fill(0.0)
-                                if block_s < sums_s.shape[0]:
-                                    run_s += count
-                                    for d in ti.static(range(3)):
-                                        total_s[d] += normal[d] * weight
-                                        total_s[3 + d] += (y[d] - at[d] - 0.5) / CELLS * weight
-                            if ti.static(sinks.has_color):
-                                at = ti.floor(x * ti.static(sinks.color.per_meter * CELLS), ti.i32)
-                                if any(at != place_c):
-                                    end_run(3, 3, block_c, place_c, run_c, total_c, now, sums_c)
-                                    if any((at >> 2) != (place_c >> 2)):
-                                        block_c = enter_voxel(
-                                            at >> 2,
-                                            3,
-                                            now,
-                                            sinks.color.index,
-                                            totals,
-                                            keys_c,
-                                            sums_c,
-                                        )
-                                    place_c = at
-                                    run_c = 0
-                                    total_c.fill(0.0)
-                                if block_c < sums_c.shape[0]:
-                                    run_c += count
-                                    total_c += (
-                                        patch_color(color, row * 2, column * 2, mask, count)
-                                        * weight
-                                    )
+                            x = move(T_world_camera, x / ti.cast(count, ti.f32))
+                            for d in ti.static(range(3)):
+                                middles[3 * n + d], facing[3 * n + d] = x[d], normal[d]
+                            sizes[n] = count
+                            marks[n] = (row * across + column) * 16 + mask
                             n += 1
                             pixels += count
                             count, mask = 0, 0
@@ -366,12 +229,50 @@ def make_patches(
                             mask |= 1 << p
                             x += lift(u, v, 1.0 / q, K)
             if ti.static(sinks.has_surface):
-                end_run(6, 2, block_s, place_s, run_s, total_s, now, sums_s)
+                blocks, cells = ti.Vector([0] * slots), ti.Vector([0] * slots)
+                find_cells(
+                    2,
+                    sinks.surface.per_meter,
+                    n,
+                    middles,
+                    now,
+                    sinks.surface.index,
+                    totals,
+                    keys_s,
+                    sums_s,
+                    blocks,
+                    cells,
+                )
+                ask_ahead(n, sums_s, blocks, cells)
+                add_surfels(
+                    sinks.surface.per_meter, n, middles, facing, sizes, now, blocks, cells, sums_s
+                )
             if ti.static(sinks.has_color):
-                end_run(3, 3, block_c, place_c, run_c, total_c, now, sums_c)
+                blocks_c, cells_c = ti.Vector([0] * slots), ti.Vector([0] * slots)
+                find_cells(
+                    3,
+                    sinks.color.per_meter,
+                    n,
+                    middles,
+                    now,
+                    sinks.color.index,
+                    totals,
+                    keys_c,
+                    sums_c,
+                    blocks_c,
+                    cells_c,
+                )
+                ask_ahead(n, sums_c, blocks_c, cells_c)
+                add_colors(n, color, across, marks, sizes, now, blocks_c, cells_c, sums_c)
             if ti.static(sinks.write):
-                patches.found[part] = n - part * ti.static(slots_of_run())
-            ti.atomic_add(totals[0], n - part * ti.static(slots_of_run()))
+                patches.found[part] = n
+                for m in range(n):
+                    at = part * slots + m
+                    for d in ti.static(range(3)):
+                        patches.points[at, d] = middles[3 * m + d]
+                        patches.normals[at, d] = facing[3 * m + d]
+                    patches.counts[at], patches.places[at] = sizes[m], marks[m]
+            ti.atomic_add(totals[0], n)
             ti.atomic_add(totals[1], pixels)
 
 
