@@ -10,7 +10,15 @@ import taichi as ti
 
 from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, Votes2, row3
 from .camera import Intrinsics
-from .cells import BLOCK_CELLS, CELLS, cell_center, cell_in_lattice, has_cell
+from .cells import (
+    BLOCK_CELLS,
+    CELLS,
+    cell_bit,
+    cell_center,
+    cell_in_lattice,
+    first_cell,
+    has_cell,
+)
 from .index import INDEX_HALF, find, voxel_of
 from .tasks import worker_stride
 
@@ -20,7 +28,8 @@ SLACK_NOISE = 0.003  # ...plus this much [1/m] times its depth squared: two sigm
 GRAZING = 0.1  # cosine; rays flatter on a surface than this cannot say that they pass through it
 ALONE = 0.45  # the surface of a cell lies within this distance of its centre [voxels]
 LEAST_TENT = 1e-6  # smallest sum of tent weights that counts; below it the default 1 is used
-FREE, SURFACE, NOTHING = range(3)  # what there is to ask in a cell: none was seen there yet, or is
+HALF = BLOCK_CELLS // 2  # cells whose bits are one word
+NEAREST = 1e-3  # [m] before a camera, from which on it may see a point
 VOTE_TASK = 16  # voxels that one task votes in
 FLAT = 0.2  # a field with a smaller slope than this has no surface to speak of
 
@@ -90,17 +99,17 @@ def seen_beside(
 def surface_vote(
     p: ti.template(),
     normal: ti.template(),
-    behind: ti.f32,
-    known: ti.i32,
-    slack: ti.f32,
+    voxel_size: ti.f32,
     k: ti.i32,
     depth: ti.template(),
     K: ti.template(),
 ):
-    """1 where a reading of view k, `behind` a point p of the surface [m, camera], saw it, -1 where it
-    passed through, else 0; on a slanted surface, depth changes across a pixel.
+    """1 where the reading of view k at a point p of the surface [m, camera] saw it, -1 where it passed
+    through, else 0; on a slanted surface, depth changes across a pixel.
     """
+    behind, known = read_behind(p, k, depth, K)
     cosine = ti.max(ti.abs(normal.dot(p)) / p.norm(), 0.02)
+    slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]
     slack += p[2] / K[0] * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine
     vote = 0
     if known == 0:
@@ -110,6 +119,12 @@ def surface_vote(
     elif behind > -slack:
         vote = 1
     return vote
+
+
+@ti.func
+def column3(rows: ti.template(), cell: ti.i32):
+    """What three rows of a value a cell hold of a cell."""
+    return ti.Vector([rows[d * BLOCK_CELLS + cell] for d in ti.static(range(3))])
 
 
 @ti.func
@@ -154,6 +169,44 @@ def views_of(
     return seen
 
 
+@ti.func
+def ask_view(
+    # in:
+    points: ti.template(),
+    half: ti.i32,
+    R: ti.template(),
+    corner: ti.template(),
+    voxel_size: ti.f32,
+    k: ti.i32,
+    depth: ti.template(),
+    K: ti.template(),
+):
+    """Of half a voxel's cells, as bits: whose points view k reads, and which it reads behind.
+
+    A loop without branches and stores, which the compiler makes one over eight cells at once.
+    """
+    width, height = ti.cast(depth.shape[2], ti.f32), ti.cast(depth.shape[1], ti.f32)
+    seen, passed = ti.u32(0), ti.u32(0)
+    for c in range(HALF):
+        cell = half * HALF + c
+        x = ti.Vector([points[cell], points[BLOCK_CELLS + cell], points[2 * BLOCK_CELLS + cell]])
+        p = corner + R @ x
+        per_depth = 1.0 / ti.max(p[2], NEAREST)
+        u = p[0] * per_depth * K[0] + K[2] + 0.5
+        v = p[1] * per_depth * K[1] + K[3] + 0.5
+        column = ti.cast(ti.min(ti.max(u, 0.0), width - 1.0), ti.i32)
+        row = ti.cast(ti.min(ti.max(v, 0.0), height - 1.0), ti.i32)
+        reading = depth[k, row, column]
+        inside = (p[2] > NEAREST) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        known = inside & (reading > 0)
+        behind = reading - p[2]
+        slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]
+        bit = ti.u32(1) << ti.cast(HALF - 1 - c, ti.u32)
+        seen |= ti.select(known & (ti.abs(behind) <= slack), bit, ti.u32(0))
+        passed |= ti.select(known & (behind > slack), bit, ti.u32(0))
+    return seen, passed
+
+
 @ti.kernel
 def vote_cells(
     # in:
@@ -178,45 +231,51 @@ def vote_cells(
         if i % stride == 0:
             first = begin + i // stride * VOTE_TASK
             for s in range(first, ti.min(first + VOTE_TASK, end)):
-                seen = views_of(s, keys, voxel_size, depth, K, T_camera_world)
-                if seen != 0:
+                views = views_of(s, keys, voxel_size, depth, K, T_camera_world)
+                if views != 0:
                     F = ti.Vector([0.0] * rank)
                     for a in range(rank):
                         F[a] = latents[s, a, 0]
-                    kinds = ti.Vector([0] * BLOCK_CELLS)
                     votes = ti.Vector([0] * BLOCK_CELLS)
-                    points = ti.Vector([0.0] * (3 * BLOCK_CELLS))
+                    points = ti.Vector([0.0] * (3 * BLOCK_CELLS))  # all x, then y, then z
                     normals = ti.Vector([0.0] * (3 * BLOCK_CELLS))
+                    surface = ti.Vector([ti.u32(0), ti.u32(0)])  # cells that hold some
                     for cell in range(BLOCK_CELLS):  # once for all views
                         x, normal = cell_center(cell), ti.Vector([0.0, 0.0, 0.0])
                         if has_cell(masks, s, cell) != 0:
                             x, normal, found = cell_surface(rank, F, cell, features)
-                            kinds[cell] = SURFACE if found else NOTHING
+                            if found:
+                                surface[cell // HALF] |= cell_bit(cell % HALF)
                         for d in ti.static(range(3)):
-                            points[3 * cell + d], normals[3 * cell + d] = x[d], normal[d]
+                            points[d * BLOCK_CELLS + cell] = x[d]
+                            normals[d * BLOCK_CELLS + cell] = normal[d]
                     for k in range(T_camera_world.shape[0]):
-                        if (seen >> ti.cast(k, ti.u32)) & 1 != 0:
+                        if (views >> ti.cast(k, ti.u32)) & 1 != 0:
                             R, corner = rotation_and_corner(T_camera_world, k, s, keys, voxel_size)
-                            for cell in range(BLOCK_CELLS):
-                                if kinds[cell] != NOTHING:
-                                    at = 3 * cell
-                                    x = ti.Vector([points[at], points[at + 1], points[at + 2]])
-                                    p = corner + R @ x
-                                    behind, known = read_behind(p, k, depth, K)
-                                    slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]
-                                    if known and ti.abs(behind) <= slack:  # as mostly
-                                        votes[cell] += kinds[cell]  # whatever the angle
-                                    elif kinds[cell] == FREE:
-                                        # record that this view saw through, in case a later frame
-                                        # extrapolates a surface here
-                                        votes[cell] -= ti.cast(known and behind > slack, ti.i32)
-                                    elif p[2] > 0:
-                                        n = ti.Vector(
-                                            [normals[at], normals[at + 1], normals[at + 2]]
-                                        )
-                                        normal = R @ n / voxel_size
+                            for half in range(2):
+                                seen, passed = ask_view(
+                                    points, half, R, corner, voxel_size, k, depth, K
+                                )
+                                seen &= surface[half]
+                                # also where no surface was seen yet: that this view saw through, in
+                                # case a later frame extrapolates one there
+                                passed &= ~masks[s, half]
+                                for c in range(HALF):
+                                    votes[half * HALF + c] += ti.cast(
+                                        (seen >> ti.cast(HALF - 1 - c, ti.u32)) & 1, ti.i32
+                                    ) - ti.cast(
+                                        (passed >> ti.cast(HALF - 1 - c, ti.u32)) & 1, ti.i32
+                                    )
+                                rest = surface[half] & ~seen
+                                while rest != 0:
+                                    c = first_cell(rest)
+                                    rest ^= cell_bit(c)
+                                    cell = half * HALF + c
+                                    p = corner + R @ column3(points, cell)
+                                    if p[2] > 0:
+                                        normal = R @ column3(normals, cell) / voxel_size
                                         votes[cell] += surface_vote(
-                                            p, normal, behind, known, slack, k, depth, K
+                                            p, normal, voxel_size, k, depth, K
                                         )
                     for cell in range(BLOCK_CELLS):
                         if votes[cell] != 0:
