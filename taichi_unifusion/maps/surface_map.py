@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .. import runtime
 from ..errors import InputError, check_box, check_range, shortened
-from ..kernels import visibility
+from ..kernels import sides, visibility
 from ..kernels.cells import CELLS
 from ..kernels.patches import Patches, Values
 from ..runtime import DeviceArray
@@ -25,7 +25,7 @@ from .local_lim import LocalLim
 from .meshing import blocks_in, drop_small_parts, extract_mesh
 from .regression_map import RegressionMap
 from .settings import MAX_RESOLUTION, SurfaceSettings
-from .sides import LOOKED_AT, Sides, count_sides, steepest
+from .sides import LOOKED_AT, Sides
 from .voxel_data import EVIDENCE, VoxelData, surface_layout
 
 
@@ -118,17 +118,20 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         """Count voxels whose surface a window saw from the other side than windows before."""
         if local.count == 0 or self.layout.information:
             return
-        keys, encoded, weights = (
-            np.asarray(a if isinstance(a, np.ndarray) else a.to_numpy())[: local.count]
-            for a in (local.keys, local.encoded, local.weights)
+        counts = np.zeros(2, np.int32)
+        sides.count_sides(
+            self.layout.rank,
+            local.count,
+            local.keys,
+            local.weights,
+            local.encoded,
+            self.grid.index,
+            self.grid["latents"],
+            self.side_gradients,
+            counts,
         )
-        slots = self.grid.slots_of(np.ascontiguousarray(keys[:, :3]))
-        known = np.flatnonzero((slots >= 0) & (weights > 0))
-        before = self.grid.rows("latents", slots[known])[:, : self.layout.rank, 0]
-        slopes = 0.5 * self.encoder.tables.encoding.gradient(LOOKED_AT / 2)  # (9, 3, l) a voxel
-        self.sides += count_sides(
-            steepest(before, slopes), steepest(encoded[known, : self.layout.rank, 0], slopes)
-        )
+        runtime.synchronize()
+        self.sides += Sides(int(counts[0]), int(counts[1]))
 
     @runtime.compiled_sooner()
     def vote(
@@ -166,6 +169,11 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         encoding = self.encoder.tables.encoding
         t = encoding.nodes(CELLS) / 2  # a voxel is the inner half of its doubled voxel
         return to_device(np.concatenate([encoding(t)[:, None], 0.5 * encoding.gradient(t)], axis=1))
+
+    @cached_property
+    def side_gradients(self) -> DeviceArray:
+        """(P, 3, l): the gradient of f_posi by voxel units where `compare` looks at a voxel."""
+        return to_device(0.5 * self.encoder.tables.encoding.gradient(LOOKED_AT / 2))
 
     def fuse_voxels(self, data: VoxelData) -> None:
         super().fuse_voxels(data)

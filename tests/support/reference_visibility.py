@@ -120,3 +120,19 @@ def interpolate_evidence(evidence, masks, x):
                 total, weight = total + tent * evidence[key][cell], weight + tent
         values[n] = total / weight if weight > 1e-6 else 1.0
     return values
+
+
+def count_sides(before, after, slopes):
+    """Of voxels whose fields (N, l, 1) are given before and in a window: how many have a clear surface
+    in both, and how many of these face the other way. Slopes (P, 3, l) are those of f_posi.
+    """
+    seen, opposite = 0, 0
+    for pair in zip(before[:, :, 0], after[:, :, 0], strict=True):
+        a, b = (
+            max((slope @ F for slope in slopes.astype(float)), key=np.linalg.norm) for F in pair
+        )
+        lengths = np.linalg.norm(a), np.linalg.norm(b)
+        if min(lengths) > 0.5:
+            seen += 1
+            opposite += a @ b < -0.7 * lengths[0] * lengths[1]
+    return seen, opposite
