@@ -8,6 +8,7 @@ and `query` do.
 import sys
 
 import taichi_unifusion as uf
+from taichi_unifusion.cli.script import run_script
 from taichi_unifusion.language import make_image_encoder, make_text_encoder
 from taichi_unifusion.language.questions import ask
 from taichi_unifusion.viewer.window_live import watch_in_window
@@ -30,7 +31,4 @@ def main(format: str, path: str, model: str, *texts: str) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(*sys.argv[1:])
-    except uf.UniFusionError as error:
-        sys.exit(str(error))
+    sys.exit(run_script(main))

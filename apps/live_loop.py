@@ -7,6 +7,7 @@ python apps/live_loop.py results/mine rosbag path/to/robot.bag
 import sys
 
 import taichi_unifusion as uf
+from taichi_unifusion.cli.script import run_script
 from taichi_unifusion.datasets.live import LiveFrames, Replay
 from taichi_unifusion.datasets.realsense_camera import RealsenseCamera
 from taichi_unifusion.results import write_results
@@ -32,7 +33,4 @@ def main(out: str, format: str = "", path: str = "") -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(*sys.argv[1:4])
-    except uf.UniFusionError as error:
-        sys.exit(str(error))
+    sys.exit(run_script(main))

@@ -7,6 +7,7 @@ of your own.
 import sys
 
 import taichi_unifusion as uf
+from taichi_unifusion.cli.script import run_script
 from taichi_unifusion.results import write_results
 from taichi_unifusion.viewer.window_live import watch_in_window
 
@@ -24,7 +25,4 @@ def main(format: str, path: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(*sys.argv[1:4])
-    except uf.UniFusionError as error:
-        sys.exit(str(error))
+    sys.exit(run_script(main))

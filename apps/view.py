@@ -6,7 +6,7 @@ flies. `unifusion view --window` does the same, and takes questions.
 
 import sys
 
-import taichi_unifusion as uf
+from taichi_unifusion.cli.script import run_script
 from taichi_unifusion.viewer.results_scene import open_scene
 from taichi_unifusion.viewer.window import SceneWindow
 
@@ -20,7 +20,4 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(*sys.argv[1:])
-    except uf.UniFusionError as error:
-        sys.exit(str(error))
+    sys.exit(run_script(main))

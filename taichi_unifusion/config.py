@@ -17,6 +17,7 @@ import yaml
 from .errors import (
     ConfigError,
     InputError,
+    as_path,
     check_box,
     check_choice,
     check_range,
@@ -39,12 +40,11 @@ from .maps.settings import (
     parse_bytes,
 )
 from .preprocessing import PreprocessSettings
+from .runtime import MAX_THREADS
 from .tracking.base import TrackingSettings
 from .types import Frame
 
 S = TypeVar("S", bound=MapSettings)
-
-MAX_THREADS = 4096  # of a CPU
 
 
 @strict
@@ -181,6 +181,7 @@ def load_config(path: str | Path, base: Config | None = None) -> Config:
     Raises FileError where the file cannot be read, ConfigError, with the key's path, for an unknown
     key or a value of the wrong type or range.
     """
+    path = as_path("load_config", path)
     try:
         values = read_yaml(path)
     except InputError as error:

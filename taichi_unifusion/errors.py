@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import difflib
 import functools
+import inspect
 import numbers
+import os
 import re
 import reprlib
 import sys
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, SupportsFloat, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -28,6 +30,8 @@ _KINDS = {
     bool: "true or false",
     str: "text",
     Path: "a file's name",
+    os.PathLike: "a Path",
+    Mapping: "a dictionary",
 }
 
 
@@ -130,6 +134,29 @@ def check_range(name: str, value: float, low: float, high: float, unit: str = ""
         )
 
 
+def check_whole(name: str, value: object, low: int, high: int, unit: str = "") -> None:
+    """Raise InputError unless a whole number lies in low..high."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise InputError(f"{name}: expected a whole number, got {shortened(value)}")
+    check_range(name, int(value), low, high, unit)
+
+
+def check_kind(what: str, value: object, kind: type | tuple[type, ...], hint: str = "") -> None:
+    """Raise InputError, which ends with the hint, unless a value is of a kind, or of one of several."""
+    if not isinstance(value, kind):
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        words = " or ".join(map(_kind_words, kinds))
+        raise InputError(f"{what}: expected {words}, got {shortened(value)}{hint}")
+
+
+def as_path(what: str, value: object) -> Path:
+    """The name of a file or folder, text or a Path; raises InputError, which calls it `what`, for
+    anything else.
+    """
+    check_kind(what, value, (str, os.PathLike))
+    return Path(value)  # pyright: ignore[reportArgumentType]
+
+
 def check_box(low: Sequence[float], high: Sequence[float]) -> None:
     """Raise InputError unless every coordinate of one corner of a box is below that of the other."""
     if not all(a < b for a, b in zip(low, high, strict=True)):
@@ -140,14 +167,20 @@ def check_box(low: Sequence[float], high: Sequence[float]) -> None:
 
 
 def strict(kind: type[T]) -> type[T]:
-    """A dataclass of settings whose constructor raises InputError for an unknown keyword and for a value
-    that is not of its field's type.
+    """A class whose constructor raises InputError for an unknown keyword, and for too many values or
+    too few.
     """
     construct = kind.__init__
+    signature = inspect.signature(construct)
+    known = tuple(signature.parameters)[1:]
 
     @functools.wraps(construct)
     def __init__(self: Any, *args: Any, **keywords: Any) -> None:
-        check_keywords(kind.__name__, keywords, kind.__dataclass_fields__)  # pyright: ignore[reportAttributeAccessIssue]
+        check_keywords(kind.__name__, keywords, known)
+        try:
+            signature.bind(self, *args, **keywords)
+        except TypeError as error:
+            raise InputError(f"{kind.__name__}: {error}; it takes {', '.join(known)}") from None
         construct(self, *args, **keywords)
 
     kind.__init__ = __init__
@@ -167,9 +200,17 @@ def check_types(settings: Any) -> None:
     numbers are numbers.
     """
     for name, wanted in _field_types(type(settings)).items():
-        value = getattr(settings, name)
-        if not _is_of(value, wanted):
-            raise InputError(f"{name}: expected {_kind_words(wanted)}, got {shortened(value)}")
+        check_type(name, getattr(settings, name), wanted)
+
+
+def check_type(name: str, value: object, wanted: Any) -> None:
+    """Raise InputError unless the value of `name` is what an annotation says, numbers as in
+    `check_types`.
+    """
+    if get_origin(wanted) is Literal:
+        check_choice(name, value, get_args(wanted))
+    elif not _is_of(value, wanted):
+        raise InputError(f"{name}: expected {_kind_words(wanted)}, got {shortened(value)}")
 
 
 @functools.cache
@@ -194,7 +235,7 @@ def _is_of(value: object, wanted: Any) -> bool:
     if wanted in (float, int):
         number = numbers.Real if wanted is float else numbers.Integral
         return isinstance(value, number) and not isinstance(value, bool)
-    return wanted is Any or isinstance(value, wanted)
+    return wanted is Any or isinstance(value, origin or wanted)
 
 
 def _kind_words(wanted: Any) -> str:
@@ -204,6 +245,7 @@ def _kind_words(wanted: Any) -> str:
         return " or ".join(_kind_words(each) for each in options)
     if origin is tuple:
         return "a tuple, as ('a', 'b')" if options[0] is str else "a tuple"
+    wanted = origin or wanted
     if wanted in _KINDS:
         return _KINDS[wanted]
     return "nothing" if wanted is NoneType else f"{getattr(wanted, '__name__', wanted)}(...)"

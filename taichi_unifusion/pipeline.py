@@ -10,15 +10,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import runtime
 from .config import Config, checked
-from .datasets.loading import first_frames, load_ahead
-from .errors import FrameError, InputError, as_known
+from .datasets.loading import check_sequence, first_frames, load_ahead
+from .errors import FrameError, InputError, as_known, check_kind, strict
 from .kernels.patches import Patches
 from .language.source import FeatureSource
 from .maps import BaseMap, FeatureMap, Integration, PropertyMap, SurfaceMap
@@ -26,7 +26,6 @@ from .maps.detail import sight_of, sizes_sentence
 from .maps.follower import MapFollower
 from .maps.kept_window import KeptWindow
 from .maps.property_group import group_maps
-from .maps.settings import PropertySettings
 from .maps.tiled_mesh import joined_mesh
 from .maps.window import WindowFusion
 from .maps.window_store import WindowStore
@@ -34,6 +33,7 @@ from .maps.working_set import make_memory
 from .networks.encoders import ImageEncoder
 from .preprocessing import find_patches, invert_depth, preprocess, why_empty
 from .properties import SurfaceProperty, make_property
+from .properties.sources import PropertySource, Source, check_encoder, sources_by_name
 from .run_log import (
     SKIP_REASONS,
     EmptyFrame,
@@ -49,30 +49,12 @@ from .types import Frame, Mesh, PinholeCamera
 logger = logging.getLogger(__name__)
 
 
-class Source(Protocol):
-    """What makes an image of a property from a frame (f_im, Fig. 6), and a map for it."""
-
-    @property
-    def name(self) -> str: ...
-
-    def add_to(self, frame: Frame) -> Frame: ...
-
-    def make_map(self, frame: Frame) -> BaseMap: ...
-
-
-class PropertySource(Source, Protocol):
-    """A source whose map is made before the first frame."""
-
-    def with_settings(self, settings: PropertySettings, scale: float) -> PropertySource: ...
-
-    def make_map(self, frame: Frame | None = None) -> BaseMap: ...
-
-
 OnBorder = Callable[[RunLog, "Pipeline"], None]  # is told between two windows
 # is told of a frame that was fused, what that did, and the pipeline
 OnStep = Callable[[Frame, StepResult, "Pipeline"], None]
 
 
+@strict
 class Pipeline:
     """Fuses frames into a surface map, a colour map, and a map for every property that the
     configuration or the caller names; with an image encoder also into a map of its features.
@@ -102,8 +84,9 @@ class Pipeline:
         self.config = config = checked(config)
         self.synchronize = synchronize
         made = [make_property(text, config.property_map) for text in config.properties]
+        check_encoder(encoder)
         features = [FeatureSource(encoder, config.feature_map)] if encoder is not None else []
-        self.sources = _by_name((*made, *properties, *features))
+        self.sources: dict[str, Source] = sources_by_name((*made, *properties, *features))
         runtime.init(config.device, threads=config.threads or None)
         self.memory = make_memory(config.map_memory, tiles)
         settle = self.memory.settle if self.memory else lambda: None
@@ -115,6 +98,8 @@ class Pipeline:
                 "limit or the store of windows out"
             )
         self._maps: dict[str, BaseMap] = {}
+        for name, each in (maps or {}).items():
+            check_kind(f"maps: '{name}'", each, BaseMap, "; load_map reads one from a file")
         self._known = dict(maps or {})
         given = config.surface.voxel_size and config.color.voxel_size and not self.sources
         if config.voxel_size or given:  # nothing is left to choose
@@ -316,6 +301,7 @@ class Pipeline:
         early, an error of any kind too, is in the result, with all that was done until then; raises
         it, or DatasetError, only where not one frame could be used.
         """
+        check_sequence("Pipeline.run", sequence)
         self.settle(first_frames(sequence, stop) if not self._maps else ())
         log, failure, interrupted = RunLog(sequence, self.config.preprocess, before), None, False
         self.fusion.at_border = on_border and (lambda: on_border(log, self))
@@ -384,17 +370,6 @@ class Pipeline:
             blocks=blocks,
             flush=flush,
         )
-
-
-def _by_name(sources: Iterable[Source]) -> dict[str, Source]:
-    named: dict[str, Source] = {}
-    for source in sources:
-        if named.setdefault(source.name, source) is not source:
-            raise InputError(
-                f"property '{source.name}' is asked for twice; give one of them another name, as in "
-                f"{source.name},name=other"
-            )
-    return named
 
 
 def extract_mesh(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import runtime
-from .errors import InputError, check_types, strict
+from .errors import InputError, check_kind, check_types, strict
 from .runtime import DeviceArray
 from .types import Frame, ImageView, PointCloud
 
@@ -73,6 +73,7 @@ def preprocess(frame: Frame, settings: PreprocessSettings | None = None) -> Poin
     if not isinstance(frame, Frame):
         raise InputError(f"preprocess: expected a Frame, got {type(frame).__name__}")
     settings = settings or PreprocessSettings()
+    check_kind("preprocess", settings, PreprocessSettings)
     check_metres(frame, settings)
     runtime.current()
     views = np.empty((1, *frame.depth.shape), np.float32)

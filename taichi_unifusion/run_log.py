@@ -18,7 +18,15 @@ from .datasets.loading import index_in_recording, recording_of
 from .datasets.plausibility import guess_depth_scale, is_reading
 from .datasets.pose_convention import judge_poses
 from .datasets.pose_fit import EarlyPairs
-from .errors import DatasetError, FrameError, OutOfRange, PoseError, SizeMismatch, UniFusionError
+from .errors import (
+    DatasetError,
+    FrameError,
+    OutOfRange,
+    PoseError,
+    SizeMismatch,
+    UniFusionError,
+    check_kind,
+)
 from .maps import Integration
 from .maps.sides import Sides
 from .preprocessing import FARTHEST, PreprocessSettings
@@ -180,7 +188,10 @@ class RunLog:
         logger.warning("%s", sentence)
 
     def check_depth_scale(self, frame: Frame) -> None:
-        """Warn if the first frame with readings looks as if the depth scale were wrong."""
+        """Warn if the first frame with readings looks as if the depth scale were wrong; raises
+        InputError for what is no frame.
+        """
+        check_kind("Pipeline.run: a frame of the sequence", frame, Frame)
         recording = recording_of(self.sequence)
         scale = getattr(recording, "depth_scale", None)
         if self.scale_checked or scale is None:

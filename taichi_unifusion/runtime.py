@@ -35,6 +35,7 @@ from .errors import (
     MissingDependency,
     RuntimeStateError,
     check_choice,
+    check_whole,
 )
 
 logger = logging.getLogger(__name__)
@@ -43,6 +44,7 @@ logger = logging.getLogger(__name__)
 DeviceArray = Any
 
 DEVICES = ("auto", "cuda", "cpu")
+MAX_THREADS = 4096  # of a CPU
 STALE_LOCK = 60  # [s] Taichi locks its cache of compiled kernels for a second or two
 MAX_TREES = 12
 PROBE_SECONDS = 20.0  # a driver that has not answered by then is taken for broken
@@ -184,6 +186,8 @@ def init(
     """
     global _runtime
     check_choice("device", device, DEVICES)
+    if threads is not None:
+        check_whole("threads", threads, 0, MAX_THREADS)
     if _runtime is not None:
         if device in ("auto", _runtime.device):
             return current()

@@ -9,39 +9,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import NoneType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import FrameError, InputError, PoseError, SizeMismatch, shortened
+from .errors import FrameError, InputError, PoseError, SizeMismatch, check_kind, shortened, strict
 from .geometry.camera import PinholeCamera
+from .geometry.checks import as_numbers, check_array, check_rigid
 from .geometry.triangles import used_vertices
-
-# |R^T R - I| and |det R - 1|: text files of 6 digits pass, a scale of 0.1 % does not
-RIGID_TOLERANCE = 1e-3
-
-
-def check_rigid(T: NDArray, name: str = "T_world_camera") -> NDArray[np.float64]:
-    """Return T as a (4, 4) float64 rigid transform, or raise PoseError with the numbers that are
-    off.
-    """
-    T = np.asarray(T, dtype=np.float64)
-    if T.shape != (4, 4):
-        raise PoseError(f"{name}: expected a 4x4 matrix, got shape {T.shape}")
-    if not np.isfinite(T).all():
-        raise PoseError(f"{name}: holds NaN or infinite numbers")
-    if not np.allclose(T[3], (0, 0, 0, 1), atol=1e-6):
-        raise PoseError(
-            f"{name}: last row is {T[3].tolist()}, not 0 0 0 1; is the matrix transposed?"
-        )
-    R = T[:3, :3]
-    det, skew = float(np.linalg.det(R)), float(np.abs(R.T @ R - np.eye(3)).max())
-    if abs(det - 1) > RIGID_TOLERANCE or skew > RIGID_TOLERANCE:
-        raise PoseError(
-            f"{name}: not a rotation (det R = {det:.4f}, max |R^T R - I| = {skew:.4f}; "
-            f"both must be within {RIGID_TOLERANCE} of 1 and 0)"
-        )
-    return T
 
 
 def largest_magnitude(values: NDArray[np.float32]) -> float:
@@ -86,6 +62,7 @@ class ImageView:
         return replace(self, T_camera_cloud=self.T_camera_cloud @ np.linalg.inv(T_b_a))
 
 
+@strict
 @dataclass(frozen=True)
 class Frame:
     """One RGB-D image with its camera and, if known, its pose."""
@@ -103,9 +80,9 @@ class Frame:
 
     def __post_init__(self) -> None:
         at = self.label
-        for name, image in (("depth", self.depth), ("color", self.color)):
-            if image is not None and not isinstance(image, np.ndarray):
-                raise FrameError(f"{at}: {name} must be a NumPy array, got {type(image).__name__}")
+        check_array(f"{at}: depth", self.depth, FrameError)
+        if self.color is not None:
+            check_array(f"{at}: color", self.color, FrameError)
         if not isinstance(self.camera, PinholeCamera):
             raise FrameError(f"{at}: camera must be a PinholeCamera, got {shortened(self.camera)}")
         if self.depth.ndim != 2 or self.depth.dtype != np.float32:
@@ -123,7 +100,11 @@ class Frame:
                     f"{at}: color must be (H, W, 3) uint8 RGB, got {self.color.shape} {self.color.dtype}"
                 )
             self._check_size(at, "color", self.color)
+        check_kind(f"{at}: images", self.images, Mapping, "; name an image by frame.with_image")
+        check_kind(f"{at}: features", self.features, Mapping, "; frame.with_features adds some")
         for name, image in self.images.items():
+            check_kind(f"{at}: name of an image", name, str)
+            check_array(f"{at}: image '{name}'", image, FrameError)
             if image.ndim != 3 or image.dtype != np.float32:
                 raise FrameError(
                     f"{at}: image '{name}' must be (H, W, c) float32, got {image.shape} {image.dtype}"
@@ -179,7 +160,7 @@ class Frame:
 
     def with_image(self, name: str, image: NDArray) -> Frame:
         """A copy that also carries the property image `name`, (H, W) or (H, W, c)."""
-        image = np.ascontiguousarray(image, dtype=np.float32)
+        image = as_numbers(f"{self.label}: image '{name}'", image)
         return replace(
             self, images={**self.images, name: image[..., None] if image.ndim == 2 else image}
         )
@@ -194,7 +175,7 @@ class Frame:
         """A copy that also carries the feature image `name`, (h, w, c), of the same view at any
         resolution.
         """
-        values = np.ascontiguousarray(values, dtype=np.float32)
+        values = as_numbers(f"{self.label}: features '{name}'", values)
         if values.ndim != 3:
             raise FrameError(
                 f"{self.label}: features '{name}' must be (h, w, c), got {values.shape}"
@@ -207,6 +188,7 @@ class Frame:
 UNIT_TOLERANCE = 0.02
 
 
+@strict
 @dataclass(frozen=True)
 class PointCloud:
     """Points with unit normals towards the camera and any sampled properties, all in one frame of
@@ -225,6 +207,11 @@ class PointCloud:
     counts: NDArray[np.int32] | None = None  # (N,) pixels that each point is the mean of; None: one
 
     def __post_init__(self) -> None:
+        for what in (self.attributes, self.features):
+            check_kind(
+                "point cloud: attributes and features", what, Mapping, ", as {'color': array}"
+            )
+        check_array("point cloud: points", self.points)
         for name, array, columns in (
             ("points", self.points, 3),
             ("normals", self.normals, 3),
@@ -232,10 +219,7 @@ class PointCloud:
         ):
             if array is None:
                 continue
-            if not isinstance(array, np.ndarray):
-                raise InputError(
-                    f"point cloud: {name} must be a NumPy array, got {type(array).__name__}"
-                )
+            check_array(f"point cloud: {name}", array)
             if (
                 array.ndim != 2
                 or (columns and array.shape[1] != columns)
@@ -259,12 +243,14 @@ class PointCloud:
             object.__setattr__(self, "normals", np.ascontiguousarray(self.normals))
             self._check_unit_normals()
         if self.counts is not None:
+            check_array("point cloud: counts", self.counts)
             if self.counts.shape != (len(self.points),) or self.counts.dtype != np.int32:
                 raise InputError(
                     f"point cloud: counts must be ({len(self.points)},) int32, got "
                     f"{self.counts.shape} {self.counts.dtype}"
                 )
             object.__setattr__(self, "counts", np.ascontiguousarray(self.counts))
+        check_kind("point cloud: view", self.view, (ImageView, NoneType))
         if self.view is not None and (
             self.view.values.ndim != 2 or not np.isfinite(self.view.values.sum())
         ):
@@ -344,6 +330,10 @@ class Mesh:
     attributes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check_array("mesh: vertices", self.vertices)
+        check_array("mesh: faces", self.faces)
+        if self.faces.dtype.kind not in "iu":
+            raise InputError(f"mesh: faces must be whole numbers, got {self.faces.dtype}")
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3:
             raise InputError(f"mesh: vertices must be (V, 3), got {self.vertices.shape}")
         if self.faces.ndim != 2 or self.faces.shape[1] != 3:
@@ -362,7 +352,7 @@ class Mesh:
 
     def with_attribute(self, name: str, values: NDArray) -> Mesh:
         """A copy with `values`, (V,) or (V, c), at the vertices under `name`."""
-        values = np.ascontiguousarray(values, dtype=np.float32)
+        values = as_numbers(f"mesh: attribute '{name}'", values)
         return replace(
             self,
             attributes={**self.attributes, name: values[:, None] if values.ndim == 1 else values},
@@ -377,6 +367,7 @@ class Mesh:
 
     def transformed(self, T_b_a: NDArray) -> Mesh:
         """This mesh of frame a in frame b, by a rigid transform (4, 4); without normals."""
+        T_b_a = check_rigid(T_b_a, "T_b_a")
         vertices = self.vertices @ T_b_a[:3, :3].T + T_b_a[:3, 3]
         return Mesh(vertices.astype(np.float32), self.faces, None, self.attributes)
 
@@ -395,6 +386,8 @@ class Trajectory:
     T_world_camera: NDArray[np.float64]  # (N, 4, 4)
 
     def __post_init__(self) -> None:
+        check_array("trajectory: timestamps", self.timestamps)
+        check_array("trajectory: T_world_camera", self.T_world_camera)
         n = len(self.timestamps)
         if self.timestamps.shape != (n,) or self.T_world_camera.shape != (n, 4, 4):
             raise InputError(

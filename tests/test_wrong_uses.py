@@ -11,6 +11,7 @@ import pytest
 from places import DEVICE
 
 import taichi_unifusion as uf
+from taichi_unifusion.datasets import Dataset
 from taichi_unifusion.errors import InputError, UniFusionError
 from taichi_unifusion.maps import FeatureMap
 from taichi_unifusion.maps.keywords import FeatureKeywords, PropertyKeywords, SurfaceKeywords
@@ -106,6 +107,123 @@ WRONG = {
         "first corner must be below",
     ),
 }
+
+
+def empty_mesh() -> uf.Mesh:
+    return uf.Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+
+
+def room() -> Dataset:
+    return uf.open_dataset("synthetic", frames=2, width=32, height=24)
+
+
+# What a caller hands over where something else belongs; PoseError and FrameError tell of frames.
+WRONG_VALUES = {
+    "one frame to run": (lambda: uf.Pipeline().run(FRAME), r"got one Frame: give \[frame\]"),
+    "a path to run": (lambda: uf.Pipeline().run("recording"), "expected a sequence of frames"),
+    "a generator to run": (lambda: uf.Pipeline().run(f for f in [FRAME]), "expected a sequence"),
+    "arrays to run": (lambda: uf.Pipeline().run([DEPTH, DEPTH]), "expected Frame"),
+    "a name for a property": (
+        lambda: uf.Pipeline(properties=["saliency"]),
+        "expected SurfaceProperty.*Config.properties=",
+    ),
+    "a name for an encoder": (
+        lambda: uf.Pipeline(encoder="clip"),
+        "with a name and image_features",
+    ),
+    "a number for a map": (lambda: uf.Pipeline(maps={"surface": 3}), "maps: 'surface': expected"),
+    "a setting of Config": (lambda: uf.Pipeline(voxel_size=0.05), "there is no 'voxel_size'"),
+    "a dict for settings": (
+        lambda: uf.preprocess(FRAME, {"depth_max": 3}),
+        "expected PreprocessSettings",
+    ),
+    "centimetres": (lambda: uf.Config(voxel_size=5), "must lie in 0.0001..2 metres"),
+    "millimetres for voxels": (
+        lambda: uf.SurfaceMap(voxel_size=50),
+        "must lie in 0.0001..2 metres",
+    ),
+    "an unknown device": (lambda: uf.Config(device="gpu"), "device: 'gpu' is unknown"),
+    "text as threads": (lambda: uf.init(DEVICE, threads="4"), "threads: expected a whole number"),
+    "no channels": (lambda: uf.PropertyMap("x"), "missing a required argument: 'channels'"),
+    "text as channels": (lambda: uf.PropertyMap("x", "3"), "channels: expected a whole number"),
+    "half a channel": (lambda: uf.PropertyMap("x", 1.5), "channels: expected a whole number"),
+    "text as points": (lambda: uf.SurfaceMap().sdf("here"), "points: expected an array of numbers"),
+    "a mesh as points": (lambda: uf.SurfaceMap().sdf(empty_mesh()), "points: expected an array"),
+    "a size as resolution": (
+        lambda: uf.SurfaceMap().extract_mesh(0.01),
+        "resolution: expected a whole number",
+    ),
+    "text as blocks": (lambda: uf.SurfaceMap().extract_mesh(blocks="all"), "blocks: expected"),
+    "a path to merge": (lambda: uf.SurfaceMap().merge("map"), "merge: expected BaseMap.*load_map"),
+    "no path to load": (lambda: uf.load_map(None), "load_map: expected text or a Path"),
+    "no path to save": (lambda: uf.SurfaceMap().save(None), "save: expected text or a Path"),
+    "no path for a mesh": (lambda: empty_mesh().save(None), "mesh file: expected text or a Path"),
+    "a dict to load": (
+        lambda: uf.load_config({"window": 1}),
+        "load_config: expected text or a Path",
+    ),
+    "a number for a path": (lambda: uf.open_dataset("7scenes", 3), "expected text or a Path"),
+    "text as frames": (
+        lambda: uf.open_dataset("synthetic", frames="two"),
+        "option 'frames': expected a whole number",
+    ),
+    "a word for a frame": (lambda: room()["first"], "by a whole number or a slice"),
+    "text as a width": (
+        lambda: uf.PinholeCamera("16", 12, 15.0, 15.0, 7.5, 5.5),
+        "width: expected",
+    ),
+    "a camera without focus": (
+        lambda: uf.PinholeCamera(16, 12, None, 15.0, 7.5, 5.5),
+        "fx: expected a number",
+    ),
+    "distortion": (
+        lambda: uf.PinholeCamera(16, 12, 15.0, 15.0, 7.5, 5.5, [0.1]),
+        "too many positional arguments",
+    ),
+    "no depth": (lambda: uf.Frame(None, CAMERA), "depth must be a NumPy array, got NoneType"),
+    "a name for a pose": (
+        lambda: uf.Frame(DEPTH, CAMERA, T_world_camera="identity"),
+        "T_world_camera: expected an array of numbers",
+    ),
+    "a ragged pose": (
+        lambda: uf.Frame(DEPTH, CAMERA, T_world_camera=[[1, 0], [0]]),
+        "T_world_camera: expected an array",
+    ),
+    "images in a list": (lambda: uf.Frame(DEPTH, CAMERA, images=[DEPTH]), "expected a dictionary"),
+    "text as an image": (lambda: FRAME.with_image("x", "abc"), "image 'x': expected an array"),
+    "text as features": (lambda: FRAME.with_features("f", "x"), "features 'f': expected an array"),
+    "an array as attributes": (
+        lambda: uf.PointCloud(POINTS, None, POINTS),
+        "attributes and features: expected a dictionary",
+    ),
+    "a frame as a view": (lambda: uf.PointCloud(POINTS, view=FRAME), "view: expected ImageView"),
+    "text as a transform": (
+        lambda: uf.PointCloud(POINTS).transformed("left"),
+        "T_b_a: expected an array",
+    ),
+    "lists for a mesh": (
+        lambda: uf.Mesh([[0, 0, 0]], [[0, 0, 0]]),
+        "vertices must be a NumPy array",
+    ),
+    "faces of fractions": (
+        lambda: uf.Mesh(POINTS, np.array([[0, 1, 2.5]])),
+        "faces must be whole numbers",
+    ),
+    "a rotation for a mesh": (lambda: empty_mesh().transformed(np.eye(3)), "expected a 4x4 matrix"),
+    "lists for a trajectory": (
+        lambda: uf.Trajectory([0.0], [np.eye(4)]),
+        "timestamps must be a NumPy array",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_VALUES)
+def test_a_wrong_value_is_one_sentence(name):
+    use, told = WRONG_VALUES[name]
+    with pytest.raises(UniFusionError, match=told) as raised:
+        use()
+    assert isinstance(raised.value, ValueError)
+    assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
 
 
 @pytest.mark.parametrize("name", WRONG)

@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 
 import lazy_loader
 
-from ..errors import DatasetError, InputError, convert, did_you_mean, is_convertible
+from ..errors import (
+    DatasetError,
+    InputError,
+    as_path,
+    check_type,
+    convert,
+    did_you_mean,
+    is_convertible,
+)
 from .dataset import Dataset, DatasetView
 from .mending import MENDINGS, Mending
 
@@ -125,8 +133,10 @@ def open_dataset(format: str, path: str | Path | None = None, **options: Any) ->
     format = known_format(format, path)
     opener = _opener(format)
     known = format_options(format)
-    for option in options:
+    for option, value in options.items():
         _check_option(option, format, known)
+        if option not in MENDINGS:
+            check_type(f"option '{option}'", value, known[option].type)
     mending = Mending.of(options)
     options = {name: value for name, value in options.items() if name not in MENDINGS}
     if not mending.changes:
@@ -148,7 +158,7 @@ def _open(
         if inspect.signature(opener).parameters["path"].default is inspect.Parameter.empty:
             raise DatasetError(f"format '{format}' needs the path of a recording")
         return opener(**options)
-    path = Path(path).expanduser()
+    path = as_path(f"path of a recording, format '{format}'", path).expanduser()
     if not os.path.exists(path):  # unlike Path.exists it answers for any name
         raise DatasetError(f"{path}: no such file or folder")
     return opener(path, **options)

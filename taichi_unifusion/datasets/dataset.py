@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Self, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FrameError, InputError
+from ..errors import FrameError, InputError, shortened
 from ..geometry.velocities import FRAME_RATE, velocities
 from ..types import Frame
 
@@ -88,9 +88,13 @@ class Dataset(ABC, Sequence[Frame]):
     def __getitem__(self, index):
         if isinstance(index, slice):
             return DatasetView(self, range(len(self))[index])
+        if not isinstance(index, int | np.integer):
+            raise InputError(
+                f"{self.name}: frames are chosen by a whole number or a slice, got {shortened(index)}"
+            )
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.name}: frame {index} of {len(self)}")
-        return self.load(index % len(self))
+        return self.load(int(index) % len(self))
 
     def __iter__(self) -> Iterator[Frame]:
         return (self.load(i) for i in range(len(self)))

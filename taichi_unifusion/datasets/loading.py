@@ -7,11 +7,26 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
+from ..errors import InputError, shortened
 from ..types import Frame
 from .dataset import DatasetView
 from .live import Arriving
 
+
 FIRST, STRIDE = 5, 5  # of the first frames: how many tell the scale, and how far apart they are
+
+
+def check_sequence(what: str, sequence: object) -> None:
+    """Raise InputError for what cannot be indexed as a sequence of frames."""
+    if isinstance(sequence, Frame):
+        raise InputError(
+            f"{what}: expected a sequence of frames, got one Frame: give [frame], or use step(frame)"
+        )
+    indexed = hasattr(sequence, "__len__") and hasattr(sequence, "__getitem__")
+    if not indexed or isinstance(sequence, str | bytes | dict):
+        raise InputError(
+            f"{what}: expected a sequence of frames, as open_dataset gives or a list, got {shortened(sequence)}"
+        )
 
 
 def load_ahead(sequence: Sequence[Frame], start: int = 0) -> Iterator[Callable[[], Frame]]:
@@ -41,9 +56,11 @@ def first_frames(sequence: Sequence[Frame], stop: Callable[[], bool]) -> Iterato
         if stop():
             return
         try:
-            yield sequence[i]
+            frame = sequence[i]
         except Exception:  # noqa: BLE001 - whoever loads the frame in its turn hears of it
             continue
+        if isinstance(frame, Frame):
+            yield frame
 
 
 def recording_of(sequence: Sequence[Frame]) -> Sequence[Frame]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from ..errors import InputError, MissingDependency
+from ..errors import InputError, MissingDependency, as_path
 from .atomic import atomic_write
 from .glb import write_glb
 from .ply import Triangles, colors_of, write_ply
@@ -24,7 +24,7 @@ def write_mesh(path: str | os.PathLike, mesh: Triangles, T_up_world: NDArray | N
     is. Raises InputError for another suffix, bad face indices or an empty GLB/OBJ, FileError where
     the file cannot be written.
     """
-    path = Path(path)
+    path = as_path("mesh file", path)
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise InputError(

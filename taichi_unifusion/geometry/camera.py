@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, shortened, strict
+
+NUMBERS = {"width": Integral, "height": Integral, "fx": Real, "fy": Real, "cx": Real, "cy": Real}
 
 
+@strict
 @dataclass(frozen=True)
 class PinholeCamera:
     """Pinhole intrinsics without distortion: u = fx x / z + cx, v = fy y / z + cy, pixel centres at
@@ -24,6 +28,11 @@ class PinholeCamera:
     cy: float
 
     def __post_init__(self) -> None:
+        for name, kind in NUMBERS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind):
+                wanted = "a whole number" if kind is Integral else "a number"
+                raise InputError(f"camera: {name}: expected {wanted}, got {shortened(value)}")
         numbers = (self.fx, self.fy, self.cx, self.cy)
         if not all(np.isfinite(numbers)) or self.fx <= 0 or self.fy <= 0:
             raise InputError(

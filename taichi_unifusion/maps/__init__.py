@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
+from ..errors import as_path
+
 if TYPE_CHECKING:
     from .base_map import BaseMap, Integration
     from .feature_map import FeatureMap
@@ -47,7 +49,7 @@ def load_map(path: str | Path) -> BaseMap:
     """
     from .stored import read_stored
 
-    description, data = read_stored(Path(path))
+    description, data = read_stored(as_path("load_map", path))
     made = empty_map(description)
     made.grid.add(data)
     return made

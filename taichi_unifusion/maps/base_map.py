@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Generic, NoReturn, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, MapCorrupt, shortened
+from ..errors import InputError, MapCorrupt, as_path, check_kind, shortened
 from ..files.maps import write_map
 from ..types import Frame, PointCloud
 from .settings import MapSettings, check_name
@@ -130,6 +130,7 @@ class BaseMap(ABC, Generic[S]):
 
         Raises InputError where they differ.
         """
+        check_kind("merge", other, BaseMap, "; load_map reads one from a file")
         mine, theirs = self._identity(), other._identity()
         if mine != theirs:
             raise InputError(
@@ -153,8 +154,8 @@ class BaseMap(ABC, Generic[S]):
         """Write the map to one file; readable on any device. Raises FileError where that fails; an
         old file then stays.
         """
-        voxels = self.voxels()
-        write_map(Path(path), voxels.tensors, {**self.manifest(), "voxels": len(voxels)})
+        path, voxels = as_path("save", path), self.voxels()
+        write_map(path, voxels.tensors, {**self.manifest(), "voxels": len(voxels)})
 
     def manifest(self) -> dict[str, Any]:
         """What kind of map this is, in JSON values."""
@@ -170,7 +171,7 @@ class BaseMap(ABC, Generic[S]):
         """Read a map of this kind written by `save`, or one in tiles, all of which then have to fit in
         memory; raises MapCorrupt, FileError or CapacityError.
         """
-        description, data = read_stored(Path(path))
+        description, data = read_stored(as_path("load", path))
         if description.kind != cls.kind:
             raise MapCorrupt(f"{path}: holds a map of kind '{description.kind}', not '{cls.kind}'")
         return cls.restored(description, data)

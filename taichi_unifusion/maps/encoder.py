@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..geometry.checks import as_numbers
 from ..kernels import query, regression, ti
 from ..kernels.cells import CELLS
 from ..kernels.layout import Layout
@@ -186,7 +187,7 @@ class Decoder:
 
 def check_points(points: NDArray) -> NDArray[np.float32]:
     """Points (N, 3) as kernels take them; raises InputError for another shape."""
-    points = np.ascontiguousarray(points, dtype=np.float32)
+    points = as_numbers("points", points)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"query: points must be (N, 3), got {points.shape}")
     return points

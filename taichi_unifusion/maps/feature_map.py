@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..errors import FrameError, InputError
+from ..errors import FrameError, InputError, strict
+from ..geometry.checks import as_numbers
 from ..kernels import feature_query as decoding
 from ..kernels import features as kernels
 from ..kernels import ti
@@ -46,6 +47,7 @@ class _SeenPixels:
     weights: NDArray[np.float32]  # (B,) points of a block that have a pixel
 
 
+@strict
 class FeatureMap(BaseMap[FeatureSettings]):
     """A continuous field of feature vectors on the surface, fused from the feature image `name` of
     point clouds.
@@ -272,7 +274,9 @@ class FeatureMap(BaseMap[FeatureSettings]):
         voxel covers the point; elsewhere as `PropertyMap.query`. Raises InputError where the texts
         have another number of channels.
         """
-        texts = np.ascontiguousarray(np.atleast_2d(text_embedding), dtype=np.float32)
+        texts = np.atleast_2d(
+            as_numbers(f"feature map '{self.name}': text embedding", text_embedding)
+        )
         if texts.ndim != 2 or texts.shape[1] != self.channels:
             raise InputError(
                 f"feature map '{self.name}': holds features of {self.channels} channels, the text "

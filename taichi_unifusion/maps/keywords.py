@@ -80,9 +80,7 @@ def shows_keywords(kind: type[MapSettings]) -> Callable[[F], F]:
             inspect.Parameter(
                 each.name,
                 inspect.Parameter.KEYWORD_ONLY,
-                default=inspect.Parameter.empty
-                if each.default is dataclasses.MISSING
-                else each.default,
+                default=getattr(kind(), each.name),
                 annotation=each.type,
             )
             for each in dataclasses.fields(kind)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..errors import InputError
+from ..errors import InputError, strict
 from ..kernels.patches import Patches, Values
 from ..runtime import DeviceArray
 from ..types import Frame, PointCloud, largest_magnitude
@@ -25,6 +25,7 @@ from .voxel_data import property_layout
 NEAREST_REACH = 2  # voxels
 
 
+@strict
 class PropertyMap(RegressionMap[PropertySettings]):
     """A continuous field of `channels` values on the surface, fused from the attribute `name` of
     point clouds.

@@ -8,14 +8,22 @@ import re
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
-from ..errors import InputError, check_choice, check_range, check_types, shortened, strict
+from ..errors import (
+    InputError,
+    check_choice,
+    check_range,
+    check_types,
+    check_whole,
+    shortened,
+    strict,
+)
 from .encoding import EncoderSettings
 
 MAX_RESOLUTION = 32  # mesh cells along a voxel's edge
 MAX_WINDOW = 31  # frames that are fused at once: a voxel has a bit for each
 # of a map: kernels unroll over it, and with more would compile for minutes, deaf to Ctrl-C
 MAX_RANK = 64
-LEAST_VOXEL, LARGEST_VOXEL = 1e-4, 100.0  # [m]
+LEAST_VOXEL, LARGEST_VOXEL = 1e-4, 2.0  # [m]
 MAX_FEATURE_RANK = 20  # of a map of features: its kernels unroll over it
 # of a map of a property: its kernels unroll over them, and compile for half a minute
 MAX_PROPERTY_CHANNELS = 64
@@ -195,6 +203,7 @@ class FeatureSettings(MapSettings):
 
 def check_channels(what: str, channels: int, most: int) -> None:
     """Raise InputError for a map of no or too many channels; `what` names the map."""
+    check_whole(f"{what}: channels", channels, -(2**63), 2**63)
     if not 1 <= channels <= most:
         hint = "; vectors of hundreds of numbers go into a FeatureMap" * (most < channels)
         raise InputError(f"{what}: channels must lie in 1..{most}, got {channels}{hint}")

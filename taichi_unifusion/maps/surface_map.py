@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import runtime
-from ..errors import InputError, check_box, check_range, shortened
+from ..errors import InputError, check_box, check_range, check_whole, shortened
+from ..geometry.checks import as_numbers
 from ..kernels import sides, visibility
 from ..kernels.cells import CELLS
 from ..kernels.patches import Patches, Values
@@ -228,13 +229,15 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         if flush:
             self.flush()
         runtime.check_alive(self.grid.runtime)
-        check_range("extract_mesh: resolution", resolution, 1, MAX_RESOLUTION, "cells a voxel")
+        check_whole("extract_mesh: resolution", resolution, 1, MAX_RESOLUTION, "cells a voxel")
         check_range("extract_mesh: min_area", min_area, 0, 1e6, "square metres")
         if blocks is not None and min_area > 0:
             raise InputError(
                 "extract_mesh: min_area needs the whole mesh, since blocks cut parts in pieces: leave "
                 "one of min_area and blocks out"
             )
+        if blocks is not None:
+            blocks = as_numbers("extract_mesh: blocks", blocks, np.int32).reshape(-1, 3)
         box = None if bounds is None else box_of(bounds)
         if box is not None and blocks is None:
             blocks = blocks_in(self.grid.voxel_keys(), box / self.voxel_size)

@@ -731,7 +731,9 @@ def test_the_app_goes_through_the_same_pipeline(recording, tmp_path, monkeypatch
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):  # or a window would wait for somebody
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "argv", ["reconstruct.py", "folder", str(recording), str(tmp_path)])
-    runpy.run_path(str(ROOT / "apps" / "reconstruct.py"), run_name="__main__")
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / "apps" / "reconstruct.py"), run_name="__main__")
+    assert ended.value.code == 0
     assert "3 frames used, 0 skipped" in capsys.readouterr().out
     with contextlib.suppress(FileNotFoundError):
         (tmp_path / "mesh.obj").unlink()
