@@ -12,7 +12,6 @@ from ..types import Frame
 from .dataset import DatasetView
 from .live import Arriving
 
-
 FIRST, STRIDE = 5, 5  # of the first frames: how many tell the scale, and how far apart they are
 
 
