@@ -25,6 +25,7 @@ from functools import cache
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import FrameType, SimpleNamespace
 from typing import Any
 from weakref import WeakSet
@@ -54,6 +55,8 @@ OTHER_THREAD = """maps are used by the thread that started Taichi alone: do all 
 it frames and questions through a queue.Queue"""
 STARTED_AGAIN = """Taichi was started again by other code (ti.init), and the memory of all maps is gone: use \
 ti.init only before the first map, or start a new process"""
+NO_CACHE = """compiled kernels cannot be kept here, so that every start compiles them anew; set \
+TI_OFFLINE_CACHE_FILE_PATH to a folder of yours"""
 GIB = 1 << 30
 # CUDA's pool for sparse voxels: this share of the GPU's memory within limits, and where that is not known
 POOL_SHARE, POOL_LIMITS, POOL_UNKNOWN = 0.25, (1 * GIB, 8 * GIB), 2 * GIB
@@ -197,19 +200,13 @@ def init(
     ti = import_taichi()
     if not debug:
         _quicken_tracing()
-    _free_kernel_cache(
-        os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")
-        or ti.lang.impl.default_cfg().offline_cache_file_path
-    )
-    options: dict[str, Any] = {
-        "log_level": ti.ERROR,
-        "offline_cache": True,
-        "debug": debug,
-        "default_fp": ti.f32,
-        "default_ip": ti.i32,
-    }
-    if threads:
-        options["cpu_max_num_threads"] = threads
+    folder = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")
+    folder = folder or ti.lang.impl.default_cfg().offline_cache_file_path
+    if not (kept := _open_kernel_cache(folder)):
+        logger.warning("%s: %s", folder, NO_CACHE)
+    options = {"log_level": ti.ERROR, "default_fp": ti.f32, "default_ip": ti.i32}
+    options |= {"offline_cache": kept, "debug": debug}
+    options |= {"cpu_max_num_threads": threads} if threads else {}
     trouble, memory = ("", 0) if device == "cpu" else _probe_cuda()
     if device == "cuda" and trouble:
         raise RuntimeStateError(f"device: CUDA was asked for but {trouble}; or use device 'cpu'")
@@ -226,7 +223,8 @@ def init(
         )
     if trouble and trouble != NO_DRIVER:  # there is a GPU, which somebody might want to use
         logger.warning("CUDA is not used: %s", trouble)
-    _runtime = Runtime(found, _describe(found, threads), pool if found == "cuda" else 0)
+    cpu = f"CPU ({_cpu_name()}, {threads or os.cpu_count()} threads)"
+    _runtime = Runtime(*(found, "CUDA GPU", pool) if found == "cuda" else (found, cpu, 0))
     name = "Taichi" if ti.__name__ == "taichi" else ti.__name__
     _say(f"{name} {'.'.join(map(str, ti.__version__))} on {_runtime.description}")
     return _runtime
@@ -258,14 +256,20 @@ def synchronize() -> None:
     ti.sync()
 
 
-def _free_kernel_cache(folder: str) -> None:
-    """Remove the lock that a killed process left in Taichi's cache: under it every start would
-    compile all kernels again.
+def _open_kernel_cache(folder: str) -> bool:
+    """Whether Taichi can keep compiled kernels in a folder; where it cannot, it would end the process.
+
+    Removes the lock of a process that was killed, under which every start would compile all kernels
+    again; one from the future too, for the clock may have been set back.
     """
-    lock = Path(folder) / "ticache.lock"
+    cache, lock = Path(folder), Path(folder) / "ticache.lock"
     with suppress(OSError):
-        if time.time() - lock.stat().st_mtime > STALE_LOCK:
-            lock.unlink()
+        cache.mkdir(parents=True, exist_ok=True)
+        if lock.exists() and abs(time.time() - lock.stat().st_mtime) > STALE_LOCK:
+            lock.unlink(missing_ok=True)
+        with TemporaryFile(dir=cache):
+            return all(os.access(file, os.R_OK | os.W_OK) for file in cache.glob("ticache*"))
+    return False
 
 
 def _quicken_tracing() -> None:
@@ -418,17 +422,9 @@ def _sparse_pool(asked_gb: float | None, memory: int) -> int:
     return int(asked_gb * GIB)
 
 
-def _describe(device: str, threads: int | None) -> str:
-    if device == "cuda":
-        return "CUDA GPU"
-    return f"CPU ({_cpu_name()}, {threads or os.cpu_count()} threads)"
-
-
 def _cpu_name() -> str:
-    try:
+    with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
-    except OSError:
-        pass
     return platform.processor() or platform.machine()

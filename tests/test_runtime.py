@@ -17,9 +17,11 @@ from taichi_unifusion.errors import InputError
 GETFRAMEINFO = inspect.getframeinfo
 
 
-@pytest.mark.parametrize(("age", "stays"), [(1, True), (3600, False)])
+@pytest.mark.parametrize(("age", "stays"), [(1, True), (3600, False), (-86400, False)])
 def test_only_an_old_lock_is_taken_from_the_cache_of_kernels(age, stays, tmp_path):
-    """A fresh one belongs to a process that is writing; an old one to a process that was killed."""
+    """A fresh one belongs to a process that is writing; an old one to a process that was killed, and
+    one from tomorrow too: the clock was set back.
+    """
     lock = tmp_path / "ticache.lock"
     lock.touch()
     os.utime(lock, (time.time() - age,) * 2)
@@ -42,7 +44,7 @@ def test_only_an_old_lock_is_taken_from_the_cache_of_kernels(age, stays, tmp_pat
         (("libcuda.so.1", "libcuda.so"), 0, ""),
     ],
 )
-def test_a_driver_that_cannot_be_used_is_found_out_without_starting_it(
+def test_X3_a_driver_that_cannot_be_used_is_found_out_without_starting_it(
     libraries, answer, said, monkeypatch
 ):
     def load(name):
@@ -86,8 +88,23 @@ def test_another_taichi_that_is_not_there_is_named(tmp_path):
     assert "UNIFUSION_TAICHI=taichi_of_nobody: there is no such package" in done.stderr
 
 
-def test_a_cache_that_is_not_there_is_no_error(tmp_path):
-    runtime._free_kernel_cache(str(tmp_path / "none"))
+def test_a_cache_that_is_not_there_is_made(tmp_path, caplog):
+    assert runtime._open_kernel_cache(str(tmp_path / "of" / "kernels"))
+    assert (tmp_path / "of" / "kernels").is_dir() and not caplog.text
+
+
+def test_a_cache_that_cannot_be_written_is_not_used_and_that_is_said(tmp_path):
+    """Taichi would end the process, after everything is written or before."""
+    (tmp_path / "file").touch()  # also for root, who may write everywhere, no folder
+    code = "import taichi_unifusion as uf; uf.warm_up(); print('done')"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "file" / "cache")},
+    )
+    assert done.returncode == 0 and done.stdout.endswith("done\n"), done.stderr
+    assert done.stderr.count("compiled kernels cannot be kept") == 1
 
 
 @ti.kernel
@@ -162,3 +179,28 @@ def test_starting_under_a_redirected_output_prints_nothing_of_taichis_own():
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     assert "shell" not in done.stdout + done.stderr
+
+
+def test_X3_without_a_gpu_the_cpu_is_used_which_is_said_once():
+    code = (
+        "import taichi_unifusion as uf; uf.init(); uf.init('auto'); uf.SurfaceMap(); uf.init('cpu')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"CUDA_VISIBLE_DEVICES": "-1"},
+    )
+    assert (done.stdout + done.stderr).count(" on CPU (") == 1
+
+
+def test_X3_cuda_that_is_asked_for_and_absent_is_an_error():
+    code = "import taichi_unifusion as uf; uf.init('cuda')"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"CUDA_VISIBLE_DEVICES": "-1"},
+    )
+    assert "RuntimeStateError: device: CUDA was asked for but" in done.stderr

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from numpy.typing import NDArray
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ..config import MeshSettings
 from ..errors import FileError, InputError, UniFusionError
@@ -48,6 +48,8 @@ class ExtractMesh:
         arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="(default: everything)"),
     ] = None
     """Only what lies in this box of the world: its lowest and its highest corner, in metres."""
+    repair: FlagCreatePairsOff[bool] = False
+    """Leave out voxels whose numbers are damaged, instead of refusing their map."""
     device: Device = "auto"
     """Where to compute."""
 
@@ -117,12 +119,12 @@ def _mesh_of(maps: Mapping[str, Path], memory: MapMemory | None, options: Extrac
     if memory is not None:
         return joined_mesh(memory, options.resolution, options.min_area, options.bounds)
     properties = {
-        name: PropertyMap.load(path)
+        name: PropertyMap.load(path, repair=options.repair)
         for name, path in maps.items()
         if read_description(path).kind == PropertyMap.kind  # others give vertices no value
     }
     return pipeline.extract_mesh(
-        SurfaceMap.load(maps["surface"]),
+        SurfaceMap.load(maps["surface"], repair=options.repair),
         properties,
         options.resolution,
         options.min_area,

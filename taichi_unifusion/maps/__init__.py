@@ -43,13 +43,14 @@ MAP_KINDS = {  # kind, as in files -> module here, class
 }
 
 
-def load_map(path: str | Path) -> BaseMap:
+def load_map(path: str | Path, *, repair: bool = False) -> BaseMap:
     """The map in a file, or in the folder of its tiles, of whatever kind it is; raises MapCorrupt,
-    FileError or CapacityError.
+    FileError or CapacityError. With `repair`, voxels of a file that are damaged are left out, and
+    that is said.
     """
     from .stored import read_stored
 
-    description, data = read_stored(as_path("load_map", path))
+    description, data = read_stored(as_path("load_map", path), repair)
     made = empty_map(description)
     made.grid.add(data)
     return made

@@ -167,11 +167,11 @@ class BaseMap(ABC, Generic[S]):
         }
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
+    def load(cls, path: str | Path, *, repair: bool = False) -> Self:
         """Read a map of this kind written by `save`, or one in tiles, all of which then have to fit in
-        memory; raises MapCorrupt, FileError or CapacityError.
+        memory; raises MapCorrupt, FileError or CapacityError. `repair` as in `load_map`.
         """
-        description, data = read_stored(as_path("load", path))
+        description, data = read_stored(as_path("load", path), repair)
         if description.kind != cls.kind:
             raise MapCorrupt(f"{path}: holds a map of kind '{description.kind}', not '{cls.kind}'")
         return cls.restored(description, data)

@@ -4,9 +4,10 @@ wrote it, so kind, settings, sizes and numbers are checked before a map is made 
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from functools import partial
 from typing import Any, Literal, get_origin, get_type_hints
 
@@ -37,6 +38,8 @@ from .voxel_data import (
     property_fields,
     surface_fields,
 )
+
+logger = logging.getLogger(__name__)
 
 # of a stored number: what is decoded from twenty of them stays finite
 LARGEST = 1e37
@@ -102,10 +105,14 @@ def describe_tiles(folder: TileFolder) -> MapDescription:
     return _described(folder.index, manifest)
 
 
-def read_stored(path: str | os.PathLike[str]) -> tuple[MapDescription, VoxelData]:
+def read_stored(
+    path: str | os.PathLike[str], repair: bool = False
+) -> tuple[MapDescription, VoxelData]:
     """Description and voxels of a map file, or of all tiles of a map; errors as `read_description`.
 
-    Sizes are compared with the settings before a tensor is read, numbers before they are used.
+    Sizes are compared with the settings before a tensor is read, numbers before they are used. With
+    `repair`, voxels of a file whose numbers cannot be are left out, which is said, instead of
+    refusing the file.
     """
     if TileFolder.is_one(path):
         folder = TileFolder.open(path)
@@ -126,10 +133,30 @@ def read_stored(path: str | os.PathLike[str]) -> tuple[MapDescription, VoxelData
         return description, VoxelData(fields.pop(KEYS.name), fields)
     tensors, manifest = read_map(path, check=partial(describe, path))
     description = describe(path, manifest)
+    if repair:
+        description, tensors = _repaired(path, description, tensors)
     _check_voxels(path, description, tensors)
     return description, VoxelData(
         tensors["keys"], {field.name: tensors[field.name] for field in description.fields}
     )
+
+
+def _repaired(
+    path: object, description: MapDescription, tensors: Mapping[str, NDArray]
+) -> tuple[MapDescription, Mapping[str, NDArray]]:
+    """Only the voxels whose numbers can be those of a map, and how many are left."""
+    keys = tensors["keys"]
+    sound = ((keys >= -INDEX_HALF) & (keys < INDEX_HALF)).all(axis=1)
+    sound &= tensors["weights"] > KINDS[description.kind].least_weight
+    for values in tensors.values():
+        if values.dtype.kind == "f":
+            can_be = np.abs(values) <= LARGEST  # False for NaN
+            sound &= can_be.reshape(len(keys), -1).all(axis=1)
+    if (lost := int(np.count_nonzero(~sound))) == 0:
+        return description, tensors
+    logger.warning("%s: %d of %d voxels are damaged and left out", path, lost, len(keys))
+    kept = {name: values[sound] for name, values in tensors.items()}
+    return replace(description, voxels=len(keys) - lost), kept
 
 
 def read_tile(folder: TileFolder, tile: Tile) -> VoxelData:
@@ -256,7 +283,10 @@ def _check_voxels(
     if not problem and _holds_twice(keys):
         problem = "a voxel twice"
     if problem:
-        raise MapCorrupt(f"{path}: holds {problem}; integrate the frames again")
+        raise MapCorrupt(
+            f"{path}: holds {problem}; integrate the frames again, or leave such voxels out: "
+            "`unifusion mesh --repair`, load_map(..., repair=True)"
+        )
 
 
 def _holds_twice(keys: NDArray[np.int32]) -> bool:

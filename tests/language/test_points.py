@@ -109,7 +109,7 @@ class Tensor:
         return self.array
 
 
-def test_files_of_torch_are_read_without_running_code(scan, tmp_path, monkeypatch):
+def test_X2_files_of_torch_are_read_without_running_code(scan, tmp_path, monkeypatch):
     _, _, features, mask = scan
     asked = {}
 

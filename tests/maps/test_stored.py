@@ -252,6 +252,28 @@ def test_M10_numbers_that_are_not_finite_are_found_when_a_map_is_loaded(files, t
             load_map(path)
 
 
+@pytest.mark.parametrize("kind", ["surface", "property"])
+def test_M10_a_repaired_map_lacks_the_damaged_voxels_alone(kind, files, tmp_path, caplog):
+    sound = load_map(files[kind]).voxels()
+
+    def spoil(tensors, manifest):
+        tensors["weights"][1] = -np.inf
+        tensors["keys"][3, 0] = 2**30
+        tensors["latents"][2, 1, 0] = np.nan
+
+    path = forged(files[kind], tmp_path / "a", spoil)
+    with pytest.raises(MapCorrupt, match="--repair"):
+        load_map(path)
+    found = load_map(path, repair=True)
+    assert f"3 of {len(sound)} voxels are damaged and left out" in caplog.text
+    left = np.setdiff1d(np.arange(len(sound)), [1, 2, 3])
+    assert (found.voxels().keys == sound.keys[left]).all()
+    for name, values in found.voxels().tensors.items():
+        assert (values == sound.tensors[name][left]).all(), name
+    found.save(tmp_path / "again")
+    assert len(load_map(tmp_path / "again")) == len(left)
+
+
 def test_M9_a_file_of_version_1_is_read_for_ever(tmp_path):
     """Written byte by byte as version 1 has it, not by today's writer: do not renew it."""
     keys = np.array([[0, 0, 0], [0, 0, 1]], "<i4")

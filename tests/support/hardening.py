@@ -24,6 +24,7 @@ IDS = {
     "F7": "images that are cut, damaged or none",
     "F8": "16-bit depth read as 8-bit",
     "F9": "a wrong depth scale",
+    "F10": "depth beyond the limit",
     "F11": "image headers that ask for gigabytes",
     "P1": "poses that are no poses",
     "P2": "mirrored, scaled, sheared rotations",
@@ -66,7 +67,11 @@ IDS = {
     "I4": "recordings that are cut",
     "I5": "bombs and odd keys in YAML",
     "X1": "networks that are missing or damaged",
+    "X2": "payloads in files of torch",
+    "X3": "no GPU",
     "X4": "networks that answer NaN",
+    "V1": "who can open the page of the viewer",
+    "V3": "no screen",
     "V4": "exit codes",
     "N3": "other orders of frames",
     "N4": "spheres, planes and boxes",
@@ -90,16 +95,12 @@ IDS = {
 # id -> why there is no test of that name
 OPEN = {
     "c1": "several large maps in a process: tested with R1 in tests/kernels/test_index.py",
-    "F10": "tested in test_pipeline.py without its id",
     "R8": "`make soak`, too long for the suite",
-    "X2": "needs torch; tested in tests/language where torch is installed",
-    "X3": "tested in test_runtime.py without its id",
-    "V1": "tested in tests/viewer without its id",
     "V2": "the viewer takes no uploads",
-    "V3": "tested in tests/viewer without its id",
     "N1": "counts of vertices are bounded by c18, not frozen",
     "N2": "every kernel has its twin in tests/support/reference*.py",
-    "K3": "extras are not installed one by one yet",
+    "P2 by option": "poses are not projected to the nearest rotation: they are refused with their numbers",
+    "K3": "`python scripts/extras.py` installs every extra by itself; figures above",
     "K4": "py.typed is tested in test_packaging.py; types are checked by `make types`",
 }
 NAME = re.compile(r"^def (test_\w+)", re.M)

@@ -73,7 +73,7 @@ def test_only_this_machine_is_answered_and_a_port_that_is_taken_gives_the_next(v
         other.close()
 
 
-def test_another_host_is_warned_of(caplog):
+def test_V1_another_host_is_warned_of(caplog):
     viewer = WebViewer(host="0.0.0.0", port=some_port())
     try:
         with caplog.at_level(logging.WARNING):

@@ -234,7 +234,7 @@ def unifusion(*words, **environment) -> subprocess.CompletedProcess:
     ("display", "told"),
     [({}, "there is no screen (DISPLAY is not set)"), ({"DISPLAY": ":1973"}, "does not answer")],
 )
-def test_without_a_screen_one_sentence_says_so(tmp_path, display, told):
+def test_V3_without_a_screen_one_sentence_says_so(tmp_path, display, told):
     from meshes import parallelogram
 
     mesh = tmp_path / "mesh.ply"
@@ -244,7 +244,7 @@ def test_without_a_screen_one_sentence_says_so(tmp_path, display, told):
     assert "`unifusion render` writes pictures" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_a_run_without_a_screen_goes_on(tmp_path):
+def test_V3_a_run_without_a_screen_goes_on(tmp_path):
     out = tmp_path / "out"
     words = ["--option", "width=80", "--option", "height=60", "--end", "2", "--out", out]
     done = unifusion("reconstruct", "synthetic", "--view-window", *words)
