@@ -16,7 +16,6 @@ import subprocess
 import sys
 import textwrap
 import threading
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
@@ -25,7 +24,6 @@ from functools import cache
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
-from tempfile import TemporaryFile
 from types import FrameType, SimpleNamespace
 from typing import Any
 from weakref import WeakSet
@@ -38,6 +36,7 @@ from .errors import (
     check_choice,
     check_whole,
 )
+from .kernel_cache import open_kernel_cache
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +45,6 @@ DeviceArray = Any
 
 DEVICES = ("auto", "cuda", "cpu")
 MAX_THREADS = 4096  # of a CPU
-STALE_LOCK = 60  # [s] Taichi locks its cache of compiled kernels for a second or two
 MAX_TREES = 12
 PROBE_SECONDS = 20.0  # a driver that has not answered by then is taken for broken
 FORKED = """Taichi was started before this process was forked and does not run here: start processes by \
@@ -55,8 +53,6 @@ OTHER_THREAD = """maps are used by the thread that started Taichi alone: do all 
 it frames and questions through a queue.Queue"""
 STARTED_AGAIN = """Taichi was started again by other code (ti.init), and the memory of all maps is gone: use \
 ti.init only before the first map, or start a new process"""
-NO_CACHE = """compiled kernels cannot be kept here, so that every start compiles them anew; set \
-TI_OFFLINE_CACHE_FILE_PATH to a folder of yours"""
 GIB = 1 << 30
 # CUDA's pool for sparse voxels: this share of the GPU's memory within limits, and where that is not known
 POOL_SHARE, POOL_LIMITS, POOL_UNKNOWN = 0.25, (1 * GIB, 8 * GIB), 2 * GIB
@@ -202,10 +198,9 @@ def init(
         _quicken_tracing()
     folder = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")
     folder = folder or ti.lang.impl.default_cfg().offline_cache_file_path
-    if not (kept := _open_kernel_cache(folder)):
-        logger.warning("%s: %s", folder, NO_CACHE)
+    folder = open_kernel_cache(folder)
     options = {"log_level": ti.ERROR, "default_fp": ti.f32, "default_ip": ti.i32}
-    options |= {"offline_cache": kept, "debug": debug}
+    options |= {"offline_cache": True, "offline_cache_file_path": folder, "debug": debug}
     options |= {"cpu_max_num_threads": threads} if threads else {}
     trouble, memory = ("", 0) if device == "cpu" else _probe_cuda()
     if device == "cuda" and trouble:
@@ -254,22 +249,6 @@ def synchronize() -> None:
     import taichi as ti
 
     ti.sync()
-
-
-def _open_kernel_cache(folder: str) -> bool:
-    """Whether Taichi can keep compiled kernels in a folder; where it cannot, it would end the process.
-
-    Removes the lock of a process that was killed, under which every start would compile all kernels
-    again; one from the future too, for the clock may have been set back.
-    """
-    cache, lock = Path(folder), Path(folder) / "ticache.lock"
-    with suppress(OSError):
-        cache.mkdir(parents=True, exist_ok=True)
-        if lock.exists() and abs(time.time() - lock.stat().st_mtime) > STALE_LOCK:
-            lock.unlink(missing_ok=True)
-        with TemporaryFile(dir=cache):
-            return all(os.access(file, os.R_OK | os.W_OK) for file in cache.glob("ticache*"))
-    return False
 
 
 def _quicken_tracing() -> None:

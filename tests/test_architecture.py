@@ -12,11 +12,13 @@ PACKAGE = Path(__file__).resolve().parents[1] / "taichi_unifusion"
 LOOSE_FILES = {"__init__", "types", "errors", "runtime", "config", "preprocessing", "pipeline"} | {
     "run_log",
     "__main__",
+    "kernel_cache",
 }
 # From the ground up. A room imports from lower floors alone, also where it imports within functions.
 FLOORS = [
     {"errors"},
-    {"runtime", "geometry"},
+    {"kernel_cache", "geometry"},
+    {"runtime"},
     {"kernels"},
     {"types"},
     {"files"},

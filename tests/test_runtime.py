@@ -13,6 +13,7 @@ from places import DEVICE
 
 from taichi_unifusion import runtime
 from taichi_unifusion.errors import InputError
+from taichi_unifusion.kernel_cache import open_kernel_cache
 
 GETFRAMEINFO = inspect.getframeinfo
 
@@ -89,7 +90,7 @@ def test_another_taichi_that_is_not_there_is_named(tmp_path):
 
 
 def test_a_cache_that_is_not_there_is_made(tmp_path, caplog):
-    assert runtime._open_kernel_cache(str(tmp_path / "of" / "kernels"))
+    assert open_kernel_cache(str(tmp_path / "of" / "kernels")) == str(tmp_path / "of" / "kernels")
     assert (tmp_path / "of" / "kernels").is_dir() and not caplog.text
 
 
@@ -101,10 +102,24 @@ def test_a_cache_that_cannot_be_written_is_not_used_and_that_is_said(tmp_path):
         [sys.executable, "-c", code],
         capture_output=True,
         text=True,
-        env=os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "file" / "cache")},
+        env=os.environ
+        | {"TI_OFFLINE_CACHE_FILE_PATH": str(tmp_path / "file" / "cache"), "TMPDIR": str(tmp_path)},
     )
     assert done.returncode == 0 and done.stdout.endswith("done\n"), done.stderr
-    assert done.stderr.count("compiled kernels cannot be kept") == 1
+    assert done.stderr.count("compiled kernels cannot be kept in") == 1
+    (mine,) = tmp_path.glob("taichi-kernels-of-*")
+    assert mine.stat().st_mode & 0o77 == 0 and any(mine.iterdir())
+
+
+def test_kernels_are_not_taken_from_a_folder_that_others_can_write(tmp_path, monkeypatch):
+    monkeypatch.setattr("taichi_unifusion.kernel_cache.gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "file").touch()
+    planted = tmp_path / f"taichi-kernels-of-{os.getuid()}"
+    planted.mkdir()
+    planted.chmod(0o777)
+    found = open_kernel_cache(str(tmp_path / "file" / "cache"))
+    assert found != str(planted) and os.stat(found).st_mode & 0o77 == 0
 
 
 @ti.kernel
