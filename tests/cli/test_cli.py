@@ -139,7 +139,7 @@ def files_in(folder: Path) -> list[str]:
         (
             ["reconstruct", "synthetic", "--out", "o", "--surface.voxel-size", "-1"],
             2,
-            ["voxel_size: must lie in 0.0001..100 metres"],
+            ["voxel_size: must lie in 0.0001..2 metres"],
         ),
         (
             ["reconstruct", "synthetic", "--out", "o", "--depth-scale", "1000"],
