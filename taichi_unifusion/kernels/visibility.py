@@ -25,7 +25,6 @@ from .tasks import worker_stride
 MOST_VOTES = 127  # votes that a cell can hold, for or against
 SLACK_VOXELS = 0.5  # a reading this far behind a point passes through it [voxels]...
 SLACK_NOISE = 0.003  # ...plus this much [1/m] times its depth squared: two sigma of a Kinect
-LEAST_COSINE = 0.02  # that says how far depth changes across a pixel
 GRAZING = 0.1  # cosine; rays flatter on a surface than this cannot say that they pass through it
 ALONE = 0.45  # the surface of a cell lies within this distance of its centre [voxels]
 LEAST_TENT = 1e-6  # smallest sum of tent weights that counts; below it the default 1 is used
@@ -109,7 +108,7 @@ def surface_vote(
     through, else 0; on a slanted surface, depth changes across a pixel.
     """
     behind, known = read_behind(p, k, depth, K)
-    cosine = ti.max(ti.abs(normal.dot(p)) / p.norm(), LEAST_COSINE)
+    cosine = ti.max(ti.abs(normal.dot(p)) / p.norm(), 0.02)
     slack = SLACK_VOXELS * voxel_size + SLACK_NOISE * p[2] * p[2]
     slack += p[2] / K[0] * ti.sqrt(1.0 - ti.min(cosine * cosine, 1.0)) / cosine
     vote = 0
@@ -182,13 +181,12 @@ def ask_view(
     depth: ti.template(),
     K: ti.template(),
 ):
-    """Of half a voxel's cells, as bits: whose points view k reads, which it reads behind, and which it
-    may have something to say about: points in the image that nothing nearer hides.
+    """Of half a voxel's cells, as bits: whose points view k reads, and which it reads behind.
 
     A loop without branches and stores, which the compiler makes one over eight cells at once.
     """
     width, height = ti.cast(depth.shape[2], ti.f32), ti.cast(depth.shape[1], ti.f32)
-    seen, passed, shown = ti.u32(0), ti.u32(0), ti.u32(0)
+    seen, passed = ti.u32(0), ti.u32(0)
     for c in range(HALF):
         cell = half * HALF + c
         x = ti.Vector([points[cell], points[BLOCK_CELLS + cell], points[2 * BLOCK_CELLS + cell]])
@@ -206,9 +204,7 @@ def ask_view(
         bit = ti.u32(1) << ti.cast(HALF - 1 - c, ti.u32)
         seen |= ti.select(known & (ti.abs(behind) <= slack), bit, ti.u32(0))
         passed |= ti.select(known & (behind > slack), bit, ti.u32(0))
-        hidden = known & (behind < -slack - p[2] / K[0] / LEAST_COSINE)
-        shown |= ti.select(inside & ~hidden, bit, ti.u32(0))
-    return seen, passed, shown
+    return seen, passed
 
 
 @ti.kernel
@@ -257,7 +253,7 @@ def vote_cells(
                         if (views >> ti.cast(k, ti.u32)) & 1 != 0:
                             R, corner = rotation_and_corner(T_camera_world, k, s, keys, voxel_size)
                             for half in range(2):
-                                seen, passed, shown = ask_view(
+                                seen, passed = ask_view(
                                     points, half, R, corner, voxel_size, k, depth, K
                                 )
                                 seen &= surface[half]
@@ -270,7 +266,7 @@ def vote_cells(
                                     ) - ti.cast(
                                         (passed >> ti.cast(HALF - 1 - c, ti.u32)) & 1, ti.i32
                                     )
-                                rest = surface[half] & shown & ~seen
+                                rest = surface[half] & ~seen
                                 while rest != 0:
                                     c = first_cell(rest)
                                     rest ^= cell_bit(c)

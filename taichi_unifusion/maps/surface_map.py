@@ -117,7 +117,7 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
 
     def compare(self, local: LocalLim) -> None:
         """Count voxels whose surface a window saw from the other side than windows before."""
-        if local.count == 0 or self.layout.information:
+        if self.layout.information:
             return
         counts = np.zeros(2, np.int32)
         sides.count_sides(
