@@ -104,9 +104,9 @@ class SurfaceSettings(MapSettings):
     pinholes; 27: none, 1: a rim all around."""
     carve: bool = True
     """Cut the mesh where more frames saw through the surface than saw it."""
-    min_evidence: float = 0.9
-    """With `carve`: keep surface that at least this many more frames saw than saw through; 1.5 asks
-    for two frames.
+    min_evidence: float = 0.5
+    """With `carve`: keep surface that at least this many more frames saw than saw through, between
+    cells in proportion; 1.5 asks for two frames.
     """
 
     def __post_init__(self) -> None:
