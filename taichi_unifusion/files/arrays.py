@@ -37,6 +37,7 @@ _DAMAGE = (  # what Python's readers of archives raise for one that is damaged, 
     NotImplementedError,
     RuntimeError,
     struct.error,
+    UnicodeDecodeError,  # names of members
 )
 
 

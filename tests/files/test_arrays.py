@@ -127,6 +127,11 @@ def test_c8_what_is_wrong_with_archives_is_said(tmp_path):
         (tmp_path / "kind.npz").write_bytes(changed)
         with pytest.raises(FileError, match="kind.npz"):
             read_archive(tmp_path / "kind.npz", ["names", "vectors"])
+    changed = bytearray(flags)
+    changed[at + 9], changed[at + 47] = 8, 0xCF  # a name that is said to be UTF-8, and is none
+    (tmp_path / "name.npz").write_bytes(changed)
+    with pytest.raises(FileError, match="name.npz.*damaged"):
+        read_archive(tmp_path / "name.npz", ["names", "vectors"])
     with zipfile.ZipFile(tmp_path / "twice.npz", "w") as archive, pytest.warns(UserWarning):
         for _ in range(2):
             content = io.BytesIO()
