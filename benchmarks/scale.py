@@ -1,28 +1,17 @@
-"""What maps in tiles and work on many processes cost.
+"""A map larger than memory: a building of many flats, which is the same flat laid out beside itself.
 
-    python benchmarks/scale.py building PATH/aws-small-house [--rows 12 --columns 10 --every 10]
-    python benchmarks/scale.py workers 7scenes PATH [--end 120] [--workers 1 2]
-    python benchmarks/scale.py chaos 7scenes PATH [--kills 20]
-    python benchmarks/scale.py model --shard-seconds S --shard-bytes B --merge-seconds M
+    python benchmarks/scale.py PATH/aws-small-house [--rows 12 --columns 10 --every 10]
 
-`building` lays the flat out beside itself, with true poses, and maps it within --map-memory; `workers`
-compares one process on all cores with workers of a thread each; `chaos` kills workers at random moments,
-and compares the map with that of an undisturbed run; `model` tells from these figures how long many
-workers need for many scans.
+Its poses are the true ones, and it is mapped within --map-memory. Prints a row for every ten flats: how
+long a frame takes, what is in memory and on disk; in the end what Open3D's grid would need.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import random
 import resource
 import shutil
-import signal
-import subprocess
-import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import astuple, replace
@@ -32,9 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from taichi_unifusion.config import Config
-from taichi_unifusion.files.mesh_reading import read_mesh
-from taichi_unifusion.files.tiles import TileFolder, map_bytes
-from taichi_unifusion.maps.stored import read_stored, read_tile
+from taichi_unifusion.files.tiles import TileFolder
+from taichi_unifusion.maps.stored import read_tile
 from taichi_unifusion.types import Frame, PinholeCamera
 
 PITCH = np.array([22.0, 14.0])  # [m] from one flat to the next, which is 19 x 11 m
@@ -48,35 +36,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    commands = parser.add_subparsers(required=True)
-    building = commands.add_parser("building")
-    building.add_argument("path", type=Path)
-    building.add_argument("--rows", type=int, default=12)
-    building.add_argument("--columns", type=int, default=10)
-    building.add_argument("--every", type=int, default=10)
-    building.add_argument("--map-memory", default="1GB")
-    building.add_argument("--out", type=Path)
-    building.add_argument("--no-mesh", action="store_true")
-    building.set_defaults(run=run_building)
-    for name, function in (("workers", run_workers), ("chaos", run_chaos)):
-        command = commands.add_parser(name)
-        command.add_argument("format")
-        command.add_argument("path")
-        command.add_argument("--end", type=int, default=120)
-        command.set_defaults(run=function)
-        if name == "workers":
-            command.add_argument("--workers", type=int, nargs="+", default=[1, 2])
-        else:
-            command.add_argument("--kills", type=int, default=20)
-    model = commands.add_parser("model")
-    for flag in ("--shard-seconds", "--shard-bytes", "--merge-seconds"):
-        model.add_argument(flag, type=float, required=True)
-    model.add_argument("--workers", type=int, default=100)
-    model.add_argument("--scans", type=int, default=10_000)
-    model.add_argument("--disk", type=float, default=1e9, help="bytes a second of the shared disk")
-    model.set_defaults(run=run_model)
-    options = parser.parse_args()
-    options.run(options)
+    parser.add_argument("path", type=Path)
+    parser.add_argument("--rows", type=int, default=12)
+    parser.add_argument("--columns", type=int, default=10)
+    parser.add_argument("--every", type=int, default=10)
+    parser.add_argument("--map-memory", default="1GB")
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--no-mesh", action="store_true")
+    run_building(parser.parse_args())
 
 
 def render_flat(path: Path, every: int, folder: Path) -> None:
@@ -170,103 +137,6 @@ def blocks_of(surface: TileFolder) -> int:
         places = np.floor(centers / (BLOCK * OPEN3D_VOXEL)).astype(np.int64)
         total += len(np.unique(places, axis=0))
     return total
-
-
-def command_of(options: argparse.Namespace, out: Path, *more: str) -> list[str]:
-    """`unifusion reconstruct` of the recording, in tiles."""
-    code = "import sys; from taichi_unifusion.cli.main import main; sys.exit(main())"
-    words = ["reconstruct", options.format, options.path, "--end", str(options.end)]
-    words += ["--out", str(out), "--color-camera", "none", "--mesh.formats", "ply", *more]
-    return [sys.executable, "-c", code, *words]
-
-
-def run_workers(options: argparse.Namespace) -> None:
-    """One process on all cores against workers of one thread each; the second run of each counts."""
-    print(
-        "processes  seconds  ratio  bytes of shards MB  surface voxels  mesh triangles", flush=True
-    )
-    base = 0.0
-    for workers in (0, *options.workers):
-        seconds, out = 0.0, Path(tempfile.mkdtemp(prefix="workers"))
-        more = ["--workers", str(workers)] if workers else ["--map-memory", "2GB"]
-        for _ in range(2):
-            started = time.perf_counter()
-            subprocess.run(command_of(options, out, *more), check=True, capture_output=True)
-            seconds = time.perf_counter() - started
-        base = base or seconds
-        stored = [map_bytes(path) for path in (out / "maps").iterdir()]
-        _, surface = read_stored(out / "maps" / "surface")
-        mesh = read_mesh(out / "mesh.ply")
-        print(
-            f"{workers or 'one':>9}  {seconds:7.1f}  {seconds / base:5.2f}  {sum(stored) / 1e6:18.1f}  "
-            f"{len(surface):14,d}  {len(mesh.faces):14,d}",
-            flush=True,
-        )
-        shutil.rmtree(out)
-
-
-def run_chaos(options: argparse.Namespace) -> None:
-    """Kill a worker now and then, until the run is done or so many were killed; compare the maps."""
-    calm, wild = (Path(tempfile.mkdtemp(prefix=name)) for name in ("calm", "wild"))
-    more = ["--workers", "2"]
-    subprocess.run(command_of(options, calm, *more), check=True, capture_output=True)
-    rng, killed, tries, code = random.Random(0), 0, 0, 1
-    while code and tries < options.kills + 3:
-        tries += 1
-        run = subprocess.Popen(
-            command_of(options, wild, *more), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-        )
-        drain = threading.Thread(target=run.communicate)
-        drain.start()
-        while run.poll() is None and killed < options.kills:
-            time.sleep(rng.uniform(2, 10))
-            if workers := _workers_of(run.pid):
-                os.kill(rng.choice(workers), signal.SIGKILL)
-                killed += 1
-                print(f"worker {killed} killed", flush=True)
-        drain.join()
-        code = run.returncode
-    print(f"{killed} workers killed in {tries} tries, the last ended with {code}")
-    for name in ("surface", "color"):
-        (_, a), (_, b) = (read_stored(each / "maps" / name) for each in (calm, wild))
-        equal = all(np.array_equal(a.tensors[part], b.tensors[part]) for part in a.tensors)
-        print(
-            f"{name}: {len(a):,} and {len(b):,} voxels, {'equal' if equal else 'DIFFERENT'} bytes"
-        )
-    shutil.rmtree(calm)
-    shutil.rmtree(wild)
-
-
-def _workers_of(parent: int) -> list[int]:
-    """Process numbers of the workers that a run has started, its own nannies left out."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*"):
-        try:
-            line = (path / "cmdline").read_bytes().replace(b"\0", b" ")
-            status = (path / "stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(status[1]) == parent and b"spawn_main" in line:
-            found.append(int(path.name))
-    return found
-
-
-def run_model(options: argparse.Namespace) -> None:
-    """Hours and bytes of many scans on many workers, each scan one shard: fusing goes in parallel, what
-    is read and written goes through one disk.
-    """
-    fuse = options.scans * options.shard_seconds / options.workers
-    merge = options.scans * options.merge_seconds / options.workers
-    moved = options.scans * options.shard_bytes * 4  # written, read to merge, merged, and its mesh
-    disk = moved / options.disk
-    print(f"{options.scans:,} scans on {options.workers} workers:")
-    print(f"fusing and voting  {fuse / 3600:8.1f} h")
-    print(f"adding up          {merge / 3600:8.1f} h")
-    print(f"shared disk        {disk / 3600:8.1f} h for {moved / 1e12:.2f} TB")
-    most = options.workers * disk / (fuse + merge)
-    print(
-        f"the disk is the limit from {options.workers * (fuse + merge) / disk:,.0f} workers on ({most:.2f} busy)"
-    )
 
 
 def peak_mb() -> float:
