@@ -40,6 +40,7 @@ from .merge import Merge, merge
 from .mesh import ExtractMesh, extract_mesh
 from .query import Query, query
 from .reconstruct import Reconstruct, reconstruct
+from .remote import local_copies
 from .render import Render, render
 from .repose import Repose, repose
 from .segment import Segment, segment
@@ -136,8 +137,8 @@ def _run(prog: str, description: str, commands: Commands, argv: list[str]) -> in
     if isinstance(command, dict):
         return _run(f"{prog} {name}", inspect.getdoc(options) or "", command, arguments)
     parsed = _parse(f"{prog} {name}", options, arguments)
-    with redirect_stdout(PlainOutput(sys.stdout)):
-        return command(parsed)
+    with redirect_stdout(PlainOutput(sys.stdout)), local_copies(parsed) as local:
+        return command(local)
 
 
 def _say_commands(prog: str, description: str, commands: Commands, arguments: list[str]) -> None:
