@@ -67,7 +67,7 @@ class Pipeline:
     them. `keep` is told of every window that was fused. Where it is a `WindowStore`, the maps can
     follow a trajectory that changes: `pipeline.follower`. With `map_memory` in the configuration,
     maps are kept within it; what does not fit lies in the folder `tiles`, a folder a map, and
-    `extract_mesh` goes through all of it. `maps` of these settings, by name, are gone on with.
+    `extract_mesh` goes through all of it. `maps`, by name, are gone on with, and tiles that are there.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Pipeline:
         features = [FeatureSource(encoder, config.feature_map)] if encoder is not None else []
         self.sources: dict[str, Source] = sources_by_name((*made, *properties, *features))
         runtime.init(config.device, threads=config.threads or None)
-        self.memory = make_memory(config.map_memory, tiles)
+        self.memory = make_memory(config.map_memory, tiles, goes_on=maps is not None)
         settle = self.memory.settle if self.memory else lambda: None
         self.fusion = WindowFusion(config.window, keep, settle)
         self.follower = MapFollower(self, keep) if isinstance(keep, WindowStore) else None

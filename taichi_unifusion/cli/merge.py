@@ -77,8 +77,9 @@ def merge(options: Merge) -> int:
         merged = {}
         for name in names:
             held = [folder.maps[name] for folder in folders if name in folder.maps]
-            parts = [as_tiles(path, out.tiled_map(f".{name}-{n}")) for n, path in enumerate(held)]
-            target = TileFolder.create(out.tiled_map(name), parts[0].manifest)
+            new = out.working_tiles
+            parts = [as_tiles(path, new / f"{name}-{n}") for n, path in enumerate(held)]
+            target = TileFolder.create(new / name, parts[0].manifest)
             tiles = {tile for part in parts for tile in part.tiles}
             voxels = merge_tiles(parts, target, tiles)
             for part, path in zip(parts, held, strict=True):
@@ -86,6 +87,8 @@ def merge(options: Merge) -> int:
                     part.remove()
             print(f"{name}: {voxels:,} voxels in {len(target.tiles)} tiles, from {len(held)} maps")
             merged[name] = target
+        merged = {name: each.moved(out.tiled_map(name)) for name, each in merged.items()}
+        shutil.rmtree(out.working_tiles, ignore_errors=True)
         memory = MapMemory.over(merged, parse_bytes(options.map_memory, "map_memory"))
         size = stream_mesh(out.mesh, memory, MeshSettings(resolution=options.resolution))
         print(f"{out.mesh}: {size.vertices:,} vertices, {size.triangles:,} triangles")

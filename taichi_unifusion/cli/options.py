@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Protocol
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
+from ..cluster.engine import ClusterSettings
 from ..config import Config
 from ..datasets import (
     FORMATS,
@@ -193,6 +194,8 @@ class RunOptions(Protocol):
     def output(self) -> OutputOptions: ...
     @property
     def settings(self) -> Config: ...
+    @property
+    def cluster(self) -> ClusterSettings: ...
 
 
 @dataclass(frozen=True)

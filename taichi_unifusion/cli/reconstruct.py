@@ -46,6 +46,7 @@ from .terminal import DONE, FAILED, frame_progress, report
 from .viewing import WatchOptions, open_watcher
 
 if TYPE_CHECKING:
+    from ..language import EncoderChoice
     from ..networks.encoders import ImageEncoder
     from ..results import RunFolder
     from ..results.record import ColorRecord, Source
@@ -80,6 +81,11 @@ class Reconstruct:
     cluster: Annotated[ClusterSettings, arg(name="")] = field(default_factory=ClusterSettings)
     settings: Settings = field(default_factory=Config, kw_only=True)
 
+    @property
+    def image_encoder(self) -> EncoderChoice | None:
+        """What makes image-text features, if they are to be mapped."""
+        return None
+
 
 def reconstruct(options: Reconstruct) -> int:
     """Frames -> maps -> mesh -> results folder."""
@@ -102,8 +108,6 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     also a map of its features.
     """
     check_poses(recording, options.poses.tracking, options.poses.trajectory)
-    if options.cluster.wanted and options.output.resume:
-        raise InputError("--resume: a run on several workers cannot go on; leave one of them out")
     if options.output.resume and (
         options.output.keep_windows or options.poses.tracking_passes == 1
     ):
@@ -112,9 +116,7 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
             "--resume out"
         )
     check_into(options, options.cluster.wanted)
-    check_workers(
-        options.cluster, encoder is not None, options.watch.view or options.watch.view_window
-    )
+    check_workers(options.cluster, options.watch.view or options.watch.view_window)
     recording, color = given_color(recording, options.recording.color_camera)
     from ..results.lock import lock_folder
     from ..results.writer import prepare_results
@@ -247,7 +249,17 @@ def _mapped(
     if options.cluster.wanted:
         poses = tracked and tracked[::every]
         mapped = Mapped(
-            *run_on_workers(frames, source, poses, options.settings, options.cluster, folder, stop),
+            *run_on_workers(
+                frames,
+                source,
+                poses,
+                options.settings,
+                options.cluster,
+                folder,
+                stop,
+                encoder=options.image_encoder,
+                resume=options.output.resume,
+            ),
             None,
             (),
         )

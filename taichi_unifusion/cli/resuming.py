@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -34,9 +35,6 @@ def open_saver(
     output, poses = options.output, options.poses
     if not output.save_every >= 0:
         raise InputError(f"--save-every: seconds must be 0 or more, got {output.save_every:g}")
-    tiled = bool(options.settings.map_memory)
-    if tiled and output.resume:
-        raise InputError("--resume: maps in tiles, as --map-memory keeps them, cannot go on yet")
     recipe = Recipe(
         config=dump_config(options.settings),
         recording=source_of(options.recording, frames),
@@ -48,8 +46,12 @@ def open_saver(
         color_camera=options.recording.color_camera,
         features=encoder.name if encoder else "",
     )
-    seconds = 0.0 if tiled else output.save_every
-    saver = RunSaver(folder, recipe, seconds, resume=output.resume)
+    saver = RunSaver(folder, recipe, output.save_every, resume=output.resume)
+    if (
+        options.cluster.wanted
+    ):  # shards are done or not; only poses that a tracker found are gone on with
+        saver.resumed = None
+        return saver
     if saver.resumed is not None:
         state = saver.resumed.state
         logger.info("going on after %d of %d frames", state.done, frames)
@@ -72,6 +74,8 @@ def is_complete(folder: RunFolder, frames: int, options: RunOptions) -> bool:
         return False
     done, source, wanted = record.frames, record.recording, options.settings
     settled = replace(wanted, voxel_size=wanted.voxel_size or used.voxel_size).settled(())
+    if options.cluster.wanted:  # what workers choose for themselves
+        settled = replace(settled, threads=used.threads, map_memory=used.map_memory)
     mode = record.tracking["mode"] if record.tracking else "given"
     asked = source_of(options.recording, frames, source and source.color)
     return (
@@ -102,16 +106,17 @@ def make_pipeline(
     """The pipeline of a run, with the maps of the safe point that it goes on from."""
     from .. import runtime
     from ..pipeline import Pipeline
-    from ..results.safe_point import read_maps, read_settings
+    from ..results.safe_point import read_maps, read_settings, restore_tiles
 
     if saver.resumed is None:
-        return Pipeline(options.settings, encoder=encoder, tiles=folder.map_folder)
+        shutil.rmtree(folder.working_tiles, ignore_errors=True)  # of a run that was killed
+        return Pipeline(options.settings, encoder=encoder, tiles=folder.working_tiles)
     settings = options.settings
     runtime.init(settings.device, threads=settings.threads or None)
     state = saver.resumed.state
-    pipeline = Pipeline(
-        read_settings(folder, state), encoder=encoder, maps=read_maps(folder, state)
-    )
+    maps = {} if restore_tiles(folder, state) else read_maps(folder, state)
+    tiles = folder.working_tiles
+    pipeline = Pipeline(read_settings(folder, state), encoder=encoder, maps=maps, tiles=tiles)
     pipeline.fusion.borders = state.borders
     return pipeline
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
 from .options import open_recording
 from .reconstruct import Reconstruct, fuse
+
+if TYPE_CHECKING:
+    from ..language import EncoderChoice
 
 
 @dataclass(frozen=True)
@@ -41,22 +44,28 @@ class Understand(Reconstruct):
     machine is used.
     """
 
+    @property
+    def image_encoder(self) -> EncoderChoice:
+        """What makes features."""
+        from ..language import EncoderChoice
+
+        device = self.settings.device
+        choices = {
+            "clip": {
+                "method": self.method,
+                "short_side": self.short_side,
+                "download": self.download,
+                "device": device,
+            },
+            "onnx": {"patch": self.patch, "device": device},
+            "folder": {"layout": self.layout},
+        }.get(self.features.partition(":")[0], {})
+        return EncoderChoice(self.features, choices)
+
 
 def understand(options: Understand) -> int:
     """Frames -> maps -> mesh -> results folder."""
     # opened first, so that an unreadable recording is reported before a network is loaded
     recording = open_recording(options.recording)
-    from ..language import make_image_encoder
-
-    device = options.settings.device
-    choices = {
-        "clip": {
-            "method": options.method,
-            "short_side": options.short_side,
-            "download": options.download,
-            "device": device,
-        },
-        "onnx": {"patch": options.patch, "device": device},
-        "folder": {"layout": options.layout},
-    }.get(options.features.partition(":")[0], {})
-    return fuse(recording, options, make_image_encoder(options.features, **choices))
+    choice = options.image_encoder
+    return fuse(recording, options, choice.make())

@@ -20,10 +20,22 @@ import numpy as np
 
 from ..errors import DatasetError, UniFusionError
 from ..files.tiles import Tile, TileFolder
+from ..maps import FeatureMap, empty_map
+from ..maps.stored import describe_tiles
 from ..pipeline import Pipeline
 from ..run_log import RunResult
 from .engine import Engine
-from .shards import Job, Shard, ShardDone, cut, joined, window_starts
+from .shards import (
+    Job,
+    Shard,
+    ShardDone,
+    count_done,
+    cut,
+    joined,
+    read_plan,
+    window_starts,
+    write_plan,
+)
 from .work import MAPS, VOTES, add_group, fuse_shard, merge_group, vote
 
 logger = logging.getLogger(__name__)
@@ -46,12 +58,16 @@ class Progress:
 def fuse_on_workers(
     job: Job, maps: Path, engine: Engine, progress: Progress
 ) -> tuple[Pipeline, RunResult]:
-    """The maps of all frames in tiles in a folder, a folder a map, and what all shards did.
+    """The maps of all frames in tiles in a folder, a folder a map, and what all shards did; a run that
+    goes on is cut where it was before.
 
     What was done for the same run before is not done again. Raises the first error of a worker,
     with what is done kept for the next try; DatasetError where no frame could be used.
     """
-    shards = plan(job, engine.workers)
+    shards = read_plan(Path(job.folder), job.source.frames) or plan(job, engine.workers)
+    write_plan(Path(job.folder), shards)
+    if earlier := count_done(Path(job.folder)):
+        logger.info("%d of %d shards are done already", earlier, len(shards))
     frames = job.source.frames
     done_frames = 0
 
@@ -124,10 +140,15 @@ def _vote(job: Job, done: Sequence[ShardDone], surface: TileFolder, engine: Engi
 def _pipeline_of(job: Job, merged: dict[str, TileFolder], maps: Path) -> Pipeline:
     """A pipeline whose maps lie in tiles in a folder, where the merged ones are moved to."""
     memory = job.config.map_memory or "2GB"
-    pipeline = Pipeline(replace(job.config, map_memory=memory), tiles=maps)
-    names = list(pipeline.maps)
+    shutil.rmtree(maps, ignore_errors=True)  # of a run that was killed
+    described = {name: describe_tiles(folder) for name, folder in merged.items()}
+    features = {
+        name: empty_map(each) for name, each in described.items() if each.kind == FeatureMap.kind
+    }  # a pipeline makes the other maps by itself
+    config = replace(job.config, map_memory=memory)
+    pipeline = Pipeline(config, tiles=maps, maps=features)
     assert pipeline.memory is not None
-    for name in names:
+    for name in pipeline.maps:
         if name in merged:
             pipeline.memory.sets[name].folder.adopt(merged[name])
     return pipeline

@@ -18,6 +18,7 @@ from ..datasets import Dataset, open_dataset
 from ..errors import FileError
 from ..files.atomic import read_bytes, write_text
 from ..geometry.se3 import distance
+from ..language import EncoderChoice
 from ..maps import Integration
 from ..maps.window import FARTHEST_MOVE, GAP, LARGEST_TURN
 from ..results.reader import registered_as
@@ -25,6 +26,8 @@ from ..results.record import Source
 from ..run_log import RunResult, SkippedFrame, StepResult
 from ..tracking.base import TrackedFrame, TrackingResult
 from ..types import Trajectory
+
+DONE, PLAN = "done.json", "plan.json"  # of a shard, of all
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Job:
     tracked: tuple[TrackedFrame, ...] | None  # their poses, if not the recording's
     config: Config  # with the sizes of all voxels
     folder: str  # where shards lie; all processes can read and write there
+    encoder: EncoderChoice | None = None  # of image-text features, if they are mapped
 
     def frames(self, first: int, last: int) -> Dataset:
         """The frames of the run from one place to another; raises DatasetError."""
@@ -128,6 +132,31 @@ def write_done(path: Path, job: Job, done: ShardDone) -> None:
     write_text(path, json.dumps(values) + "\n")
 
 
+def write_plan(folder: Path, shards: Sequence[Shard]) -> None:
+    """Keep where a run is cut, so that one which goes on with other workers is cut there too; raises
+    FileError.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / PLAN, json.dumps([[each.first, each.last] for each in shards]) + "\n")
+
+
+def read_plan(folder: Path, frames: int) -> list[Shard]:
+    """Where a run of so many frames was cut before; none where it was not."""
+    try:
+        ends = json.loads(read_bytes(folder / PLAN))
+        shards = [Shard(n, int(first), int(last)) for n, (first, last) in enumerate(ends)]
+    except (FileError, TypeError, ValueError):
+        return []
+    borders = [0, *(each.last for each in shards)]
+    firsts = [*(each.first for each in shards), frames]
+    return shards if borders == firsts else []
+
+
+def count_done(folder: Path) -> int:
+    """How many shards were done, of whatever run."""
+    return len(list(folder.glob(f"*/{DONE}")))
+
+
 def read_done(path: Path, job: Job, shard: Shard) -> ShardDone | None:
     """What is on disk of a shard that was done for the same run; None where it was not."""
     try:
@@ -161,6 +190,7 @@ def recipe(job: Job, shard: Shard) -> dict[str, Any]:
     values = {
         "source": asdict(job.source),
         "poses": poses,
+        "features": None if job.encoder is None else asdict(job.encoder),
         "config": asdict(replace(job.config, threads=0, map_memory="")),
         "frames": [shard.first, shard.last],
     }

@@ -20,11 +20,11 @@ from ..pipeline import Pipeline
 from ..run_log import SKIP_REASONS, RunResult, SkippedFrame
 from ..types import Trajectory
 from .engine import own_kernels
-from .shards import Job, Shard, ShardDone, read_done, write_done
+from .shards import DONE, Job, Shard, ShardDone, read_done, write_done
 from .votes import VOTES_MANIFEST, Voters, add_votes
 
 SHARD_MEMORY = "1GB"  # of a shard's maps, where the run names no other
-DONE, MAPS, VOTES = "done.json", "maps", "votes"  # in the folder of a shard
+MAPS, VOTES = "maps", "votes"  # in the folder of a shard
 
 
 def start(config: Config) -> None:
@@ -48,7 +48,8 @@ def fuse_shard(job: Job, shard: Shard) -> ShardDone:
         return done
     shutil.rmtree(folder, ignore_errors=True)  # what a worker left that was killed
     start(job.config)
-    pipeline = Pipeline(without_votes(job.config), tiles=folder / MAPS)
+    encoder = None if job.encoder is None else job.encoder.make()
+    pipeline = Pipeline(without_votes(job.config), encoder=encoder, tiles=folder / MAPS)
     frames = job.frames(shard.first, shard.last)
     try:
         run = pipeline.run(frames)

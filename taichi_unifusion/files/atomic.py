@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -106,6 +107,18 @@ def _followed(path: Path) -> Path:
         raise FileError(f"{path}: cannot write: this is a link of another user; remove it first")
     check_name(path)
     return Path(os.path.realpath(path))
+
+
+def link_or_copy(file: Path, other: Path) -> None:
+    """Let `other` be the same file, which nobody changes, or a copy where the disk has no links;
+    raises OSError.
+    """
+    try:
+        os.link(file, other)
+    except FileExistsError:
+        raise
+    except OSError:
+        shutil.copyfile(file, other)
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

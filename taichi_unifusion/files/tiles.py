@@ -17,7 +17,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError, MapCorrupt, convert, shortened
-from .atomic import check_writable, file_error, read_bytes, write_text
+from .atomic import check_writable, file_error, link_or_copy, read_bytes, write_text
 from .maps import read_map, write_map
 
 INDEX = "index.json"
@@ -53,7 +53,7 @@ class TileFolder:
         describes the map, in JSON values. Raises FileError where it cannot be written.
         """
         folder = cls(check_writable(path), manifest, {})
-        earlier = [file for file in folder.path.glob("*.safetensors") if _turn_of(file.name)]
+        earlier = _earlier(folder.path)
         folder._turn = 1 + max((_turn_of(file.name) for file in earlier), default=0)
         folder._write_index()
         _remove(earlier)
@@ -151,18 +151,51 @@ class TileFolder:
         self.write(waiting)
 
     def adopt(self, other: TileFolder) -> None:
-        """Move the tiles of another folder here, in place of those that are there; raises FileError."""
+        """Take over the tiles of another folder, in place of those that are here; all of them or, where
+        that fails, none. Raises FileError.
+        """
         replaced = [self.path / self.tiles[tile].file for tile in other.tiles if tile in self.tiles]
+        before, taken = dict(self.tiles), []
         try:
             for tile, each in other.tiles.items():
                 name = f"{'_'.join(map(str, tile))}.{self._turn}.safetensors"
-                os.replace(other.path / each.file, self.path / name)
+                taken.append(self.path / name)
+                link_or_copy(other.path / each.file, taken[-1])
                 self.tiles[tile] = replace(each, file=name)
-        except OSError as error:
-            raise file_error("write", self.path, error) from error
+            self._write_index()
+        except (FileError, OSError) as error:
+            self.tiles = before
+            _remove(taken)
+            raise (
+                error if isinstance(error, FileError) else file_error("write", self.path, error)
+            ) from error
         self._turn += 1
-        self._write_index()
-        _remove([*replaced, other.index])
+        _remove(replaced)
+        other.remove()
+
+    def moved(self, path: str | os.PathLike[str]) -> TileFolder:
+        """These tiles in another folder, where they replace those of an earlier map when all are there;
+        raises FileError.
+        """
+        target = TileFolder(check_writable(path), self.manifest, {})
+        earlier = _earlier(target.path)
+        target._turn = 1 + max((_turn_of(file.name) for file in earlier), default=0)
+        target.adopt(self)
+        _remove(earlier)
+        return target
+
+    def snapshot(self, path: str | os.PathLike[str]) -> TileFolder:
+        """These tiles as they are now in another, new folder too, by links where the disk has them:
+        files of tiles never change. Raises FileError.
+        """
+        copy = TileFolder(check_writable(path), self.manifest, dict(self.tiles))
+        try:
+            for each in self.tiles.values():
+                link_or_copy(self.path / each.file, copy.path / each.file)
+        except OSError as error:
+            raise file_error("write", copy.path, error) from error
+        copy._write_index()
+        return copy
 
     def remove(self) -> None:
         """Remove the tiles, the index, and the folder if it holds nothing else."""
@@ -219,6 +252,11 @@ def _turn_of(file: str) -> int:
     parts = file.split(".")
     whole = len(parts) == 3 and parts[2] == "safetensors" and parts[1].isdecimal()
     return int(parts[1]) if whole and parts[0].count("_") == 2 else 0
+
+
+def _earlier(path: Path) -> list[Path]:
+    """The files of tiles that lie in a folder, also those that no index names."""
+    return [file for file in path.glob("*.safetensors") if _turn_of(file.name)]
 
 
 def _remove(files: Iterable[Path]) -> None:

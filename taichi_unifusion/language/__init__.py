@@ -8,6 +8,8 @@ these. Your own is any object with `name`, and `image_features(frame) -> (h, w, 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
@@ -17,6 +19,7 @@ from ..networks.encoders import ImageEncoder, TextEncoder, feature_image, unit_l
 __all__ = [
     "IMAGE_ENCODERS",
     "TEXT_ENCODERS",
+    "EncoderChoice",
     "ImageEncoder",
     "TextEncoder",
     "feature_image",
@@ -48,6 +51,18 @@ TEXT_ENCODERS = {
         "FILE.npz with names and vectors, or FILE.npy beside names",
     ),
 }
+
+
+@dataclass(frozen=True)
+class EncoderChoice:
+    """An image encoder by name, as it goes to other processes, which make it there."""
+
+    text: str  # NAME:WHERE
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def make(self) -> ImageEncoder:
+        """The encoder; raises as `make_image_encoder`."""
+        return make_image_encoder(self.text, **self.options)
 
 
 def make_image_encoder(text: str, **options: Any) -> ImageEncoder:

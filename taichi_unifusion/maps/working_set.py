@@ -115,16 +115,26 @@ class WorkingSet:
         for code in gone:
             self.asked.pop(code, None)
 
+    def move(self, path: Path) -> None:
+        """Write what the folder lacks, and let the tiles lie elsewhere, in place of those of an earlier
+        map; raises FileError.
+        """
+        self.write()
+        if self.folder.path != path:
+            self.folder = self.folder.moved(path)
+
     def tiles(self) -> set[int]:
         """Codes of all tiles, in memory and on disk."""
         return set(self.sizes()) | {code_of(tile) for tile in self.folder.tiles}
 
 
 class MapMemory:
-    """Keeps maps within a limit [bytes] of memory; the rest of them lies in `folder`, a folder each."""
+    """Keeps maps within a limit [bytes] of memory; the rest of them lies in `folder`, a folder each,
+    empty at first, or with the tiles to go on with.
+    """
 
-    def __init__(self, limit: int, folder: Path) -> None:
-        self.limit, self.folder = limit, folder
+    def __init__(self, limit: int, folder: Path, *, goes_on: bool = False) -> None:
+        self.limit, self.folder, self.goes_on = limit, folder, goes_on
         self.sets: dict[str, WorkingSet] = {}
         self._turn = 0
         self._seen: dict[str, set[int]] = {}  # since `settle` was called last
@@ -138,10 +148,14 @@ class MapMemory:
         return memory
 
     def follow(self, maps: Mapping[str, BaseMap]) -> None:
-        """Take in maps that are new; raises FileError."""
+        """Take in maps that are new; raises FileError or MapCorrupt."""
         for name, each in maps.items():
             if name not in self.sets:
-                folder = TileFolder.create(self.folder / name, each.manifest())
+                path = self.folder / name
+                if self.goes_on and TileFolder.is_one(path):
+                    folder = TileFolder.open(path)
+                else:
+                    folder = TileFolder.create(path, each.manifest())
                 self.sets[name] = WorkingSet(each, folder)
 
     def see(self, frame: Frame) -> None:
@@ -208,9 +222,9 @@ class MapMemory:
             each.write()
 
 
-def make_memory(limit: str, folder: str | Path | None) -> MapMemory | None:
-    """Memory of so many bytes ("2GB") with a folder for the rest; None where there is no limit.
-    Raises InputError where it has no folder.
+def make_memory(limit: str, folder: str | Path | None, goes_on: bool) -> MapMemory | None:
+    """Memory of so many bytes ("2GB") with a folder for the rest, whose tiles are gone on with or
+    replaced; None where there is no limit. Raises InputError where it has no folder.
     """
     if not limit:
         return None
@@ -218,7 +232,7 @@ def make_memory(limit: str, folder: str | Path | None) -> MapMemory | None:
         raise InputError(
             "map_memory: name a folder for the tiles that do not fit: Pipeline(tiles=...)"
         )
-    return MapMemory(parse_bytes(limit, "map_memory"), Path(folder))
+    return MapMemory(parse_bytes(limit, "map_memory"), Path(folder), goes_on=goes_on)
 
 
 def seen_points(frame: Frame, step: float) -> NDArray[np.float64]:

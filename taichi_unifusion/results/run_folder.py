@@ -92,6 +92,11 @@ class RunFolder:
         return dict(sorted({**files, **tiled}.items()))
 
     @property
+    def working_tiles(self) -> Path:
+        """Where the maps of a run that keeps them in tiles lie until it is done."""
+        return self.path / "unfinished-tiles"
+
+    @property
     def shards(self) -> Path:
         """Where the partial maps of workers lie until a run is done."""
         return self.path / "shards"
@@ -210,17 +215,21 @@ class RunFolder:
     @property
     def safe_maps(self) -> tuple[Path, ...]:
         """The maps of safe points."""
-        return tuple(
-            file for each in self.generations for file in sorted(each.glob(self.map("*").name))
-        )
+        names = (self.map("*").name, f"*/{INDEX}")
+        found = [file for each in self.generations for name in names for file in each.glob(name)]
+        return tuple(sorted(file.parent if file.name == INDEX else file for file in found))
 
     def config_in(self, generation: Path) -> Path:
         """The settings of a safe point."""
         return generation / self.config.name
 
     def map_in(self, generation: Path, name: str) -> Path:
-        """A map of a safe point."""
+        """A map of a safe point in one file."""
         return generation / self.map(name).name
+
+    def tiles_in(self, generation: Path, name: str) -> Path:
+        """A map of a safe point in tiles."""
+        return generation / name
 
     @property
     def lock(self) -> Path:

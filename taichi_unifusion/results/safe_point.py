@@ -30,13 +30,16 @@ import yaml
 from ..config import Config, load_config
 from ..errors import FileError, InputError
 from ..files.atomic import file_error, read_bytes, write_text
+from ..files.tiles import TileFolder
 from ..maps import BaseMap, Integration, PropertyMap, SurfaceMap, load_map
+from ..maps.tiled_mesh import joined_mesh
 from ..pipeline import extract_mesh
 from ..run_log import RunSoFar, SkippedFrame, StepResult
 from ..tracking import TrackedFrame, TrackingResult, Verdict
 from ..types import Mesh
 from .record import Source, decoded
 from .run_folder import RunFolder
+from .tiled import open_memory
 
 logger = logging.getLogger(__name__)
 
@@ -104,6 +107,18 @@ def read_maps(folder: RunFolder, state: State) -> dict[str, BaseMap]:
     """The maps of a safe point; Taichi must run. Raises FileError, MapCorrupt."""
     there = folder.generation(state.generation)
     return {name: load_map(folder.map_in(there, name)) for name in state.maps}
+
+
+def restore_tiles(folder: RunFolder, state: State) -> bool:
+    """Lay out the maps of a safe point where a run keeps its tiles, if they are in tiles; whether they
+    are. Raises FileError, MapCorrupt.
+    """
+    there = folder.generation(state.generation)
+    shutil.rmtree(folder.working_tiles, ignore_errors=True)
+    found = [name for name in state.maps if TileFolder.is_one(folder.tiles_in(there, name))]
+    for name in found:
+        TileFolder.open(folder.tiles_in(there, name)).snapshot(folder.working_tiles / name)
+    return bool(found)
 
 
 def read_settings(folder: RunFolder, state: State) -> Config:
@@ -201,7 +216,10 @@ def mesh_of_safe_point(folder: RunFolder) -> Mesh | None:
     logger.info(
         "%s: not done: %d of %d frames", folder.path, state.done, state.recipe.recording.frames
     )
-    config = read_settings(folder, state)
+    config, there = read_settings(folder, state), folder.generation(state.generation)
+    paths = {name: folder.tiles_in(there, name) for name in state.maps}
+    if (memory := open_memory(paths)) is not None:
+        return joined_mesh(memory, config.mesh.resolution, config.mesh.min_area)
     maps = read_maps(folder, state)
     surface = maps["surface"]
     assert isinstance(surface, SurfaceMap)

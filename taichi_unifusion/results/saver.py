@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ..config import dump_config
@@ -121,8 +123,7 @@ class RunSaver:
             there.mkdir(exist_ok=True)
         except OSError as error:
             raise file_error("write", there, error) from error
-        for name, each in pipeline.maps.items():
-            each.save(folder.map_in(there, name))
+        self._save_maps(there, pipeline)
         write_text(folder.config_in(there), dump_config(pipeline.config))
         lines = "".join(f"{line}\n" for line in lines_of(so_far, self.steps, self.skipped))
         size = append(folder.journal, self.bytes, lines)
@@ -130,6 +131,17 @@ class RunSaver:
         self.generation, self.bytes, self.done = generation, size, so_far.done
         self.steps, self.skipped = len(so_far.steps), len(so_far.skipped)
         keep_generation(folder, generation)
+
+    def _save_maps(self, there: Path, pipeline: Pipeline) -> None:
+        if pipeline.memory is None:
+            for name, each in pipeline.maps.items():
+                each.save(self.folder.map_in(there, name))
+            return
+        pipeline.memory.save()
+        for name, each in pipeline.memory.sets.items():
+            path = self.folder.tiles_in(there, name)
+            shutil.rmtree(path, ignore_errors=True)  # of a safe point that could not be made
+            each.folder.snapshot(path)
 
     def _state(self, so_far: RunSoFar, pipeline: Pipeline, generation: int, size: int) -> State:
         return State(

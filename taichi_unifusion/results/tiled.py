@@ -6,11 +6,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from ..config import MeshSettings
 from ..files.mesh_stream import MeshStream
-from ..files.tiles import TileFolder
+from ..files.tiles import INDEX, TileFolder
 from ..maps.stored import describe_tiles
 from ..maps.tiled_mesh import mesh_pieces, on_border, parts_of_area
 from ..maps.working_set import MapMemory
@@ -23,9 +24,14 @@ PICTURE_RESOLUTION = 1  # cells a voxel of the mesh that pictures are drawn from
 
 
 def write_tiles(writer: FolderWriter, memory: MapMemory) -> None:
-    """Write what of the maps is in memory; their indices stand for all their files."""
-    for each in memory.sets.values():
-        writer.write(each.folder.index, lambda _, each=each: each.write())
+    """Write what of the maps is in memory, and let all of them lie in the folder, in place of earlier
+    ones; their indices stand for all their files.
+    """
+    for name, each in memory.sets.items():
+        path = writer.folder.tiled_map(name)
+        writer.write(path / INDEX, lambda _, each=each, path=path: each.move(path))
+    with suppress(OSError):  # where they were until now
+        memory.folder.rmdir()
 
 
 def open_memory(maps: Mapping[str, Path]) -> MapMemory | None:

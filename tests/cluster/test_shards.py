@@ -2,30 +2,37 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from direct_engine import Direct
-from tiny_recording import CONFIG, make_frames, write_folder
+from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 from windows import CONFIG as WALK_CONFIG
 from windows import place_of, seen_from, windows
 
+from taichi_unifusion.cli import on_workers
+from taichi_unifusion.cli.main import main
 from taichi_unifusion.cluster import work
 from taichi_unifusion.cluster.run import Progress, fuse_on_workers, plan
 from taichi_unifusion.cluster.shards import Job, Shard, cut, read_done, window_starts
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.errors import FileError, MapCorrupt
 from taichi_unifusion.geometry.triangles import areas
+from taichi_unifusion.language import EncoderChoice
+from taichi_unifusion.maps import load_map
 from taichi_unifusion.maps.stored import read_stored
 from taichi_unifusion.pipeline import Pipeline
-from taichi_unifusion.results.record import Source
+from taichi_unifusion.results.record import Source, read_record
+from taichi_unifusion.results.run_folder import RunFolder
 from taichi_unifusion.tracking.base import TrackedFrame, Verdict
 
 FRAMES = 12
 # latents of frames that were fused in other groups of windows: sums of floats in another order
 ROUNDING = 1e-5
+HALF = 0.01  # of features kept in half precision and 255 levels, added in another order
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +112,33 @@ def test_what_was_done_is_not_done_again(recording, tmp_path, monkeypatch):
     assert read_done(shard.folder(job) / work.DONE, other, shard) is None
 
 
+def test_the_command_goes_on_with_the_shards_that_are_done(
+    recording, tmp_path, monkeypatch, capsys
+):
+    """Cut as before, however many workers there are."""
+
+    def full(task, arguments) -> None:
+        if task is work.merge_group:
+            raise FileError("maps: cannot write: the disk is full")
+
+    engines = [Direct(full), Direct()]
+    engines[1].workers = 5
+    monkeypatch.setattr(on_workers, "open_engine", lambda _: nullcontext(engines.pop(0)))
+    arguments = ["reconstruct", "folder", str(recording), *FLAGS, "--window", "3", "--workers", "2"]
+    arguments += ["--mesh.formats", "ply", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "the disk is full" in said and "4 shards are done: the same command with" in said
+    with monkeypatch.context() as patch:
+        patch.setattr(work, "Pipeline", None)  # nothing is fused again
+        assert main([*arguments, "--resume"]) == 0
+    assert "4 of 4 shards are done already" in capsys.readouterr().err
+    out = RunFolder(tmp_path / "out")
+    assert read_record(out.record).frames.used == FRAMES and not out.shards.exists()
+    assert main([*arguments, "--resume"]) == 0
+    assert "holds the whole run already" in capsys.readouterr().err
+
+
 def test_a_worker_that_is_lost_leaves_nothing_that_counts(recording, whole, tmp_path):
     """Its half-written shard is made again from the start."""
     job, lost = job_of(recording, tmp_path), []
@@ -154,6 +188,24 @@ def test_tracked_poses_go_to_the_workers(recording, tmp_path):
     assert [frame.index for frame in run.skipped] == [5] and len(run.steps) == FRAMES - 1
     _, found = read_stored(tmp_path / "maps" / "surface")
     assert found.keys[:, 0].min() > 100
+
+
+def test_features_are_mapped_by_workers_too(recording, tmp_path):
+    rng, made = np.random.default_rng(0), tmp_path / "features"
+    made.mkdir()
+    for i in range(FRAMES):
+        np.save(made / f"{i}.npy", rng.standard_normal((9, 12, 16)).astype(np.float32))
+    encoder = EncoderChoice(f"folder:{made}")
+    whole = Pipeline(replace(CONFIG, window=3), encoder=encoder.make())
+    whole.run(open_dataset("folder", recording))
+    job = job_of(recording, tmp_path, encoder=encoder)
+    pipeline, _ = fuse_on_workers(job, tmp_path / "maps", Direct(), Progress())
+    assert pipeline.maps.keys() == whole.maps.keys()
+    expected, found = whole.maps["features"], load_map(tmp_path / "maps" / "features")
+    points = whole.extract_mesh(1).vertices[::20]
+    a, b = (each.query(points) for each in (expected, found))
+    assert len(found) == len(expected) > 100 and np.abs(a).mean() > 0.05
+    assert np.abs(a - b).mean() < HALF * np.abs(a).mean()
 
 
 def test_windows_start_where_a_pipeline_starts_them():

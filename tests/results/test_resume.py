@@ -20,6 +20,8 @@ from taichi_unifusion.cli import main as cli
 from taichi_unifusion.cli import reconstruct
 from taichi_unifusion.config import dump_config
 from taichi_unifusion.errors import FileError, InputError
+from taichi_unifusion.maps import working_set
+from taichi_unifusion.maps.stored import read_stored
 from taichi_unifusion.pipeline import Pipeline
 from taichi_unifusion.results import RunFolder, inspect, read_record, safe_point, saver
 from taichi_unifusion.results.record import Source
@@ -325,3 +327,38 @@ def test_a_run_that_is_stopped_is_written_and_can_go_on(tmp_path, monkeypatch, c
     ):
         assert file.read_text() == same.read_text()
     assert read_record(out.record).tracking["mode"] == "rgbd" and not out.unfinished.exists()
+
+
+def test_a_killed_run_in_tiles_leaves_earlier_results_and_goes_on(tmp_path, monkeypatch):
+    recording = write_folder(tmp_path / "recording", make_frames(7))
+    arguments = ["reconstruct", "folder", str(recording), *FLAGS, *WINDOW, "--map-memory", "1MB"]
+    arguments += ["--mesh.formats", "ply", "--save-every", "1e-9", "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(saver, "SHARE", 1e9)
+    monkeypatch.setattr(working_set, "parse_bytes", lambda *_: 100_000)
+    out = RunFolder(tmp_path / "out")
+    assert cli.main(arguments) == 0 and not out.working_tiles.exists()
+    files = {file: file.read_bytes() for file in out.map_folder.rglob("*") if file.is_file()}
+    expected = {name: read_stored(path)[1].tensors for name, path in out.maps.items()}
+    assert len(files) > 4
+    step = Pipeline.step
+
+    def dying(pipeline, frame):
+        if frame.index == 5:
+            raise Killed
+        return step(pipeline, frame)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(Pipeline, "step", dying)
+        cli.main(arguments)
+    assert all(file.read_bytes() == data for file, data in files.items())
+    said = inspect(out.path)
+    assert "3 of 7 frames are safe" in said.text and out.working_tiles.exists()
+    assert len(safe_point.mesh_of_safe_point(out).faces) > 100
+
+    assert cli.main([*arguments, "--resume"]) == 0
+    for name, tensors in expected.items():
+        _, found = read_stored(out.maps[name])
+        for part, values in tensors.items():
+            np.testing.assert_array_equal(found.tensors[part], values)
+    assert not out.unfinished.exists() and not out.working_tiles.exists()
+    assert not inspect(out.path).problems
