@@ -50,6 +50,8 @@ def mesh_pieces(
     groups: dict[tuple[int, ...], list[int]] = {}
     for code in sorted(tiles):
         groups.setdefault(tuple(each // TOGETHER for each in tile_of(code)), []).append(code)
+    if bounds is not None:
+        groups = {key: each for key, each in groups.items() if _meets(key, surface, bounds)}
     for done, ((slab, *_), codes) in enumerate(sorted(groups.items()), 1):
         memory.near("surface", set(tiles_around(codes)))
         firsts = np.array([tile_of(code) for code in codes], np.int32) * (TILE // MESH_BLOCK)
@@ -58,6 +60,15 @@ def mesh_pieces(
         if len(mesh.faces):
             yield slab, with_properties(memory, mesh)
         on_piece(done, len(groups))
+
+
+def _meets(group: tuple[int, ...], surface: SurfaceMap, bounds: ArrayLike) -> bool:
+    """Whether tiles that are meshed together may have a part of the mesh within bounds [m]."""
+    size = TOGETHER * TILE * surface.voxel_size
+    low, high = np.asarray(bounds, np.float64).reshape(2, 3)
+    begin = np.array(group) * size
+    edge = surface.voxel_size  # cubes of the mesh begin half a voxel before
+    return bool((begin - edge <= high).all() and (begin + size + edge >= low).all())
 
 
 def with_properties(memory: MapMemory, mesh: Mesh) -> Mesh:
