@@ -1,41 +1,42 @@
 """What the doctor is worth: every recording x every way to spoil it, and which cause it names.
 
     python benchmarks/doctor.py PATH/data
+    python benchmarks/doctor.py PATH/data --cache FOLDER --rows clock focal --only house
 
 `PATH/data` holds the shared recordings; what is not there is left out. Printed is a row for each
-spoiling: in how many recordings the right cause was named, in how many a wrong one too. A
-spoiling that changes nothing in a recording (poses of one that has none, frames out of order where the
-camera hardly moves) is not counted there, and printed as "-".
+spoiling: in how many recordings the right cause was named, in how many nothing at all was said, and in
+how many a wrong cause was named, alone or too. A spoiling that changes nothing in a recording (poses of
+one that has none, frames out of order where the camera hardly moves) is not counted there.
+`--cache` keeps the frames of each recording in a file, so that they are rendered once.
 """
 
 from __future__ import annotations
 
 import argparse
+import pickle
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
 import numpy as np
 import yaml
+from doctor_spoilings import SPOILINGS, Frames, Spoiling
 
 from taichi_unifusion.datasets import Dataset, open_dataset
 from taichi_unifusion.datasets.doctor import Diagnosis, examine
-from taichi_unifusion.datasets.mended import pose_at_time
 from taichi_unifusion.datasets.pose_fit import has_moved
 from taichi_unifusion.errors import UniFusionError
-from taichi_unifusion.geometry.quaternions import quaternion_to_rotation, rotation_to_quaternion
-from taichi_unifusion.geometry.se3 import FLIP_YZ
+from taichi_unifusion.geometry.quaternions import rotation_to_quaternion
 from taichi_unifusion.types import Frame, PinholeCamera
 
 MOST = 24  # frames of a recording
 FEW = 6  # of one that is written to files
-Frames = list[Frame]
-Change = Callable[[Frames], Frames]
 
 
 class InMemory(Dataset):
@@ -54,178 +55,21 @@ class InMemory(Dataset):
         return self.frames[index].timestamp, self.frames[index].T_world_camera
 
 
-@dataclass(frozen=True)
-class Spoiling:
-    """A way to spoil a recording, and what is to be said then."""
-
-    cause: str
-    change: Change
-    depth_scale: float = 1000.0  # that the recording would be read with
-    poses: int = 2  # frames with poses that it needs
-    moving: bool = False  # whether frames must look from different places
-
-
-# Spoiling
-
-
-def by_pose(change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    def spoil(frames: Frames) -> Frames:
-        return [replace(f, T_world_camera=change(f.require_pose())) for f in frames]
-
-    return spoil
-
-
-def longer(factor: float) -> Change:
-    def change(T: np.ndarray) -> np.ndarray:
-        changed = T.copy()
-        changed[:3, 3] *= factor
-        return changed
-
-    return by_pose(change)
-
-
-def w_first(T: np.ndarray) -> np.ndarray:
-    x, y, z, w = rotation_to_quaternion(T[None, :3, :3])[0]
-    changed = T.copy()
-    changed[:3, :3] = quaternion_to_rotation(np.array([[w, x, y, z]]))[0]
-    return changed
-
-
-def transposed(T: np.ndarray) -> np.ndarray:
-    changed = T.copy()
-    changed[:3, :3] = T[:3, :3].T
-    return changed
-
-
-def deeper(factor: float) -> Change:
-    return lambda frames: [
-        replace(f, depth=(f.depth * np.float32(factor)).astype(np.float32)) for f in frames
-    ]
-
-
-def resized(factor: float, centre: bool = True) -> Change:
-    def spoil(frames: Frames) -> Frames:
-        spoiled = []
-        for f in frames:
-            c, move = f.camera, factor if centre else 1.0
-            numbers = (
-                c.fx * factor,
-                c.fy * factor,
-                (c.cx + 0.5) * move - 0.5,
-                (c.cy + 0.5) * move - 0.5,
-            )
-            spoiled.append(replace(f, camera=PinholeCamera(c.width, c.height, *numbers)))
-        return spoiled
-
-    return spoil
-
-
-def later(seconds: float) -> Change:
-    """Poses of another moment."""
-
-    def spoil(frames: Frames) -> Frames:
-        times = np.array([f.timestamp for f in frames], np.float64)
-        poses = np.array([f.require_pose() for f in frames])
-        found = [pose_at_time(times, poses, time + seconds) for time in times]
-        return [
-            replace(f, T_world_camera=T)
-            for f, T in zip(frames, found, strict=True)
-            if T is not None
-        ]
-
-    return spoil
-
-
-def beside(right: float, down: float) -> Change:
-    """Colour moved by so many pixels of images 640 wide."""
-
-    def spoil(frames: Frames) -> Frames:
-        spoiled = []
-        for f in frames:
-            wide = f.camera.width / 640
-            moved = np.array([[1, 0, right * wide], [0, 1, down * wide]], np.float32)
-            color = np.asarray(f.color, np.uint8)
-            size = color.shape[1], color.shape[0]
-            color = cv2.warpAffine(color, moved, size, borderMode=cv2.BORDER_REPLICATE)
-            spoiled.append(replace(f, color=color))
-        return spoiled
-
-    return spoil
-
-
-def far_plane(value: float) -> Change:
-    """What is farthest, and what has no reading, as a number."""
-
-    def spoil(frames: Frames) -> Frames:
-        spoiled = []
-        for f in frames:
-            depth = f.depth.copy()
-            depth[(depth == 0) | (depth > np.percentile(depth[depth > 0], 90))] = value
-            spoiled.append(replace(f, depth=depth))
-        return spoiled
-
-    return spoil
-
-
-def exchanged(frames: Frames) -> Frames:
-    """Two frames in each other's place."""
-    a, b = len(frames) // 4, 3 * len(frames) // 4
-    spoiled = list(frames)
-    spoiled[a] = replace(frames[a], depth=frames[b].depth, color=frames[b].color)
-    spoiled[b] = replace(frames[b], depth=frames[a].depth, color=frames[a].color)
-    return spoiled
-
-
-def twice(frames: Frames) -> Frames:
-    """Every picture twice."""
-    return [
-        replace(f, depth=frames[i - i % 2].depth, color=frames[i - i % 2].color)
-        for i, f in enumerate(frames)
-    ]
-
-
-def brighter(frames: Frames) -> Frames:
-    """A jump of exposure half-way."""
-    half = len(frames) // 2
-    return [
-        f if i < half else replace(f, color=cv2.convertScaleAbs(np.asarray(f.color), alpha=1.6))
-        for i, f in enumerate(frames)
-    ]
-
-
-def one_pose(frames: Frames) -> Frames:
-    return [replace(f, T_world_camera=frames[0].T_world_camera) for f in frames]
-
-
-SPOILINGS = {
-    "depth_scale 200 for 1000": Spoiling("depth-scale", deeper(5), 200.0),
-    "depth_scale 5000 for 1000": Spoiling("depth-scale", deeper(0.2), 5000.0),
-    "depth_scale 500 for 1000": Spoiling("depth-scale", deeper(2), 500.0, moving=True),
-    "depth_scale 1 for 1000": Spoiling("depth-scale", deeper(1000), 1.0, poses=0),
-    "world to camera": Spoiling("pose-reading", by_pose(np.linalg.inv), moving=True),
-    "OpenGL axes": Spoiling("pose-reading", by_pose(lambda T: T @ FLIP_YZ), moving=True),
-    "w first": Spoiling("pose-reading", by_pose(w_first), moving=True),
-    "transposed": Spoiling("pose-reading", by_pose(transposed), moving=True),
-    "centimetres": Spoiling("pose-scale", longer(100)),
-    "millimetres": Spoiling("pose-scale", longer(1000)),
-    "times 0.37": Spoiling("pose-scale", longer(0.37), moving=True),
-    "times 3": Spoiling("pose-scale", longer(3), moving=True),
-    "clock 0.2 s late": Spoiling("clock-offset", later(0.2), poses=20, moving=True),
-    "clock 0.3 s early": Spoiling("clock-offset", later(-0.3), poses=20, moving=True),
-    "intrinsics of half the size": Spoiling("intrinsics", resized(0.5), poses=0),
-    "intrinsics of 1.5 times": Spoiling("intrinsics", resized(1.5), poses=0),
-    "focal length times 1.4": Spoiling("intrinsics", resized(1.4, False), moving=True),
-    "colour beside depth": Spoiling("color", beside(-14, 8), poses=0),
-    "far plane 1e10": Spoiling("far-plane", far_plane(1e10), poses=0),
-    "far plane 65504": Spoiling("far-plane", far_plane(65504.0), poses=0),
-    "far plane 65.535 m": Spoiling("far-plane", far_plane(65.535), poses=0),
-    "far plane 100 m": Spoiling("far-plane", far_plane(100.0), poses=0),
-    "one pose for all": Spoiling("still", one_pose, poses=4, moving=True),
-    "every picture twice": Spoiling("repeated", twice, poses=4),
-    "two frames exchanged": Spoiling("swapped", exchanged, poses=8, moving=True),
-    "jump of exposure": Spoiling("exposure", brighter, poses=4),
-}
 ON_DISK = {"numbered images": "time-stamps", "nanoseconds": "time-stamps"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is said of one recording: causes named of it unspoiled, and for every spoiling whether the
+    right cause was named (alone, as one of two that cannot be told apart, or not) and which others.
+    """
+
+    name: str
+    plain: frozenset[str] = frozenset()
+    found: Mapping[str, Cell] = field(default_factory=dict)
+
+
+Cell = tuple[str, frozenset[str]]  # right, one of two, silent or wrong; and wrong causes
 
 
 # Recordings
@@ -332,8 +176,19 @@ def examined(frames: Frames, depth_scale: float = 1000.0) -> Diagnosis:
 
 
 def causes(diagnosis: Diagnosis) -> set[str]:
-    """What it says is wrong."""
+    """What it says is wrong; of causes that it cannot tell apart the first."""
     return {finding.cause for finding in diagnosis.findings if finding.wrong}
+
+
+def verdict(diagnosis: Diagnosis, cause: str, plain: frozenset[str]) -> Cell:
+    """Whether the right cause was named, and which others, but those that are named anyhow."""
+    right = [f for f in diagnosis.findings if cause in (f.cause, *f.rivals)]
+    others = {f.cause for f in diagnosis.findings if f.wrong and f not in right} - plain
+    alone = any(not f.rivals for f in right)
+    return (
+        "right" if alone else "one of two" if right else "wrong" if others else "silent",
+        frozenset(others),
+    )
 
 
 def write_numbered(
@@ -369,31 +224,39 @@ def on_disk(name: str, frames: Frames) -> set[str]:
         return {finding.cause for finding in examine(open_dataset("folder", path)).findings}
 
 
-def row_of(task: tuple[str, str]) -> tuple[str, set[str], dict[str, tuple[bool, set[str]]]]:
-    """What is said of one recording: name, causes named of it unspoiled, and for every spoiling
-    whether the right cause was named and which others.
-    """
-    name, data = task
-    make = dict(recordings(Path(data)))[name]
+def frames_of(name: str, data: Path, cache: Path | None) -> Frames:
+    """The frames of a recording, from the cache where they are in it; raises what reading does."""
+    kept = cache / f"{name.replace(' ', '_')}.pickle" if cache else None
+    if kept is not None and kept.exists():
+        return pickle.loads(kept.read_bytes())  # ours
+    frames = timed(dict(recordings(data))[name]())
+    if kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_bytes(pickle.dumps(frames))
+    return frames
+
+
+def row_of(name: str, data: Path, cache: Path | None, titles: Sequence[str]) -> Row:
+    """What is said of one recording, spoiled in the ways of `titles`."""
     try:
-        frames = timed(make())
+        frames = frames_of(name, data, cache)
     except (UniFusionError, ImportError, OSError) as error:
         print(f"{name}: left out ({error})", file=sys.stderr, flush=True)
-        return name, set(), {}
-    plain = causes(examined(frames))
-    found: dict[str, tuple[bool, set[str]]] = {}
-    for title, spoiling in SPOILINGS.items():
-        if not applies(spoiling, frames):
+        return Row(name)
+    plain = frozenset(causes(examined(frames)))
+    found: dict[str, Cell] = {}
+    for title in titles:
+        spoiling = SPOILINGS.get(title)
+        if spoiling is None or not applies(spoiling, frames):
             continue
         diagnosis = examined(spoiling.change(frames), spoiling.depth_scale)
-        named = {finding.cause for finding in diagnosis.findings}
-        found[title] = spoiling.cause in named, causes(diagnosis) - plain - {spoiling.cause}
+        found[title] = verdict(diagnosis, spoiling.cause, plain)
     posed = [f for f in frames if f.T_world_camera is not None]
-    for title, cause in ON_DISK.items():
+    for title in (title for title in titles if title in ON_DISK):
         if len(posed) == len(frames) >= 4 and len({f.camera for f in frames}) == 1:
-            named = on_disk(title, frames)
-            found[title] = cause in named, set()
-    return name, plain, found
+            right = ON_DISK[title] in on_disk(title, frames)
+            found[title] = "right" if right else "silent", frozenset()
+    return Row(name, plain, found)
 
 
 def main() -> None:
@@ -401,46 +264,50 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("data", type=Path)
-    parser.add_argument("--only", nargs="*", help="recordings whose name begins so")
+    parser.add_argument("--only", nargs="*", default=[""], help="recordings whose name begins so")
+    parser.add_argument("--rows", nargs="*", default=[""], help="spoilings whose name begins so")
+    parser.add_argument("--cache", type=Path, help="folder that keeps the recordings' frames")
     parser.add_argument("--processes", type=int, default=1)
     options = parser.parse_args()
-    names = [name for name, _ in recordings(options.data)]
-    if options.only:
-        names = [name for name in names if name.startswith(tuple(options.only))]
+    names = [n for n, _ in recordings(options.data) if n.startswith(tuple(options.only))]
+    titles = [t for t in (*SPOILINGS, *ON_DISK) if t.startswith(tuple(options.rows))]
     started = time.perf_counter()
-    tasks = [(name, str(options.data)) for name in names]
     rows = []
+    task = partial(row_of, data=options.data, cache=options.cache, titles=titles)
     with get_context("spawn").Pool(options.processes, maxtasksperchild=1) as pool:
-        for row in pool.imap(row_of, tasks):
+        for row in pool.imap(task, names):
             rows.append(row)
-            show(*row)
-    summarize([row for row in rows if row[2]])
+            show(row)
+    summarize([row for row in rows if row.found])
     print(f"{time.perf_counter() - started:.0f} s")
 
 
-def show(name: str, plain: set[str], found: dict[str, tuple[bool, set[str]]]) -> None:
+def show(row: Row) -> None:
     """What went wrong in one recording."""
-    missed = [title for title, (right, _) in found.items() if not right]
-    others = {title: sorted(wrong) for title, (_, wrong) in found.items() if wrong}
-    print(
-        f"{name}: unspoiled {sorted(plain) or 'sound'}; missed {missed}; wrong {others}", flush=True
-    )
+    missed = [title for title, (said, _) in row.found.items() if said in ("silent", "wrong")]
+    others = {title: sorted(wrong) for title, (_, wrong) in row.found.items() if wrong}
+    plain = sorted(row.plain) or "sound"
+    print(f"{row.name}: unspoiled {plain}; missed {missed}; wrong {others}", flush=True)
 
 
-def summarize(rows: Sequence[tuple[str, set[str], dict[str, tuple[bool, set[str]]]]]) -> None:
+def summarize(rows: Sequence[Row]) -> None:
     """The matrix: a row for every spoiling."""
-    print("\n| spoiled by | recordings | right cause | a wrong one |\n|---|---|---|---|")
-    total = np.zeros(3, int)
+    print("\n| spoiled by | recordings | right | of these one of two | silent | a wrong cause |")
+    print("|---|---|---|---|---|---|")
+    total = np.zeros(5, int)
     for title in (*SPOILINGS, *ON_DISK):
-        cells = [found[title] for _, _, found in rows if title in found]
-        counts = np.array([len(cells), sum(r for r, _ in cells), sum(bool(w) for _, w in cells)])
+        cells = [row.found[title] for row in rows if title in row.found]
+        if not cells:
+            continue
+        said = [said for said, _ in cells]
+        both, wrong = said.count("one of two"), sum(bool(others) for _, others in cells)
+        counts = [len(cells), said.count("right") + both, both, said.count("silent"), wrong]
         total += counts
-        print(f"| {title} | {counts[0]} | {counts[1]} | {counts[2]} |")
-    print(
-        f"| **all** | {total[0]} | {total[1]} ({total[1] / total[0]:.1%}) | {total[2]} ({total[2] / total[0]:.1%}) |"
-    )
-    said = {name: sorted(plain) for name, plain, _ in rows if plain}
-    print(f"| nothing | {len(rows)} | {len(rows) - len(said)} sound | {said or ''} |")
+        print(f"| {title} | {' | '.join(map(str, counts))} |")
+    shares = [f"{count} ({count / max(1, total[0]):.1%})" for count in total[1:]]
+    print(f"| **all** | {total[0]} | {' | '.join(shares)} |")
+    said = {row.name: sorted(row.plain) for row in rows if row.plain}
+    print(f"| nothing | {len(rows)} | {len(rows) - len(said)} | | | {said or 0} |")
 
 
 if __name__ == "__main__":

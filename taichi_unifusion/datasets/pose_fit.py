@@ -21,6 +21,7 @@ GRID = 32  # points along each image axis
 NEAREST = 0.02  # of the median depth; nothing nearer to a camera is compared
 # share of the depth within which two measurements agree, and what a sensor may be off by however near [m]
 TOLERANCE, LEAST_TOLERANCE = 0.03, 0.02
+LEAST_ERROR = 5e-4  # relative; below it is rounding, and no difference between readings
 MIN_POINTS = 100  # compared in a pair; with fewer it says nothing
 MIN_MOTION = 0.05, np.radians(3)  # [m], [rad]; with less, all readings of poses agree
 MOST_PAIRS = 6  # of early frames
@@ -37,6 +38,9 @@ class Fit:
     share: float  # of the points that could be compared: measured at the same depth
     closeness: float  # 1 where depths are equal, 0 where they differ by the tolerance; the mean
     compared: float  # share of all points that were compared
+    error: float = (
+        1.0  # median difference of the two depths, relative; of all points that were measured
+    )
 
 
 NOTHING = Fit(0.0, 0.0, 0.0)
@@ -76,65 +80,86 @@ class PosePairs:
         T_world_camera: NDArray[np.float64] | None = None,
         scale: float = 1.0,
         camera: PinholeCamera | None = None,
+        unit: float = 1.0,
     ) -> list[Fit]:
         """The fit of every pair with these poses (N, 4, 4) of the frames, their translations times
-        `scale`, and a camera in place of the frames' own.
+        `scale`, a camera in place of the frames' own, and depth that is `unit` times too large. Where
+        the pose of either is NaN, nothing can be compared.
         """
         T = self.T_world_camera if T_world_camera is None else T_world_camera
         found = []
         for a, b in self.pairs:
+            if not np.isfinite(T[[a, b]]).all():
+                found.append(NOTHING)
+                continue
             T_b_a = np.linalg.inv(T[b]) @ T[a]
             T_b_a[:3, 3] *= scale
-            found.append(compare(self.views[a], self.views[b], T_b_a, camera))
+            found.append(compare(self.views[a], self.views[b], T_b_a, camera, unit))
         return found
+
+    def between(self, pairs: Sequence[tuple[int, int]]) -> PosePairs:
+        """The same frames, other pairs of them."""
+        others = copy(self)
+        others.pairs = tuple(pairs)
+        return others
 
     def thinned(self) -> PosePairs:
         """Every other pair, for a first look."""
-        thinner = copy(self)
-        thinner.pairs = self.pairs[::2]
-        return thinner
+        return self.between(self.pairs[::2])
 
     def fit(
         self,
         T_world_camera: NDArray[np.float64] | None = None,
         scale: float = 1.0,
         camera: PinholeCamera | None = None,
+        unit: float = 1.0,
     ) -> Fit:
         """The mean of `fits`."""
-        return mean_fit(self.fits(T_world_camera, scale, camera))
+        return mean_fit(self.fits(T_world_camera, scale, camera, unit))
 
 
 def mean_fit(fits: Sequence[Fit]) -> Fit:
     """The mean over pairs; one in which nothing could be compared counts as not close, and not for
     the share.
     """
-    told = [fit.share for fit in fits if fit is not NOTHING]
+    told = [fit for fit in fits if fit is not NOTHING]
     if not told:
         return NOTHING
     return Fit(
-        float(np.mean(told)),
+        float(np.mean([fit.share for fit in told])),
         float(np.mean([fit.closeness for fit in fits])),
         float(np.mean([fit.compared for fit in fits])),
+        float(np.exp(np.mean([np.log(fit.error) for fit in told]))),
     )
 
 
-def compare(a: View, b: View, T_b_a: NDArray, camera: PinholeCamera | None = None) -> Fit:
+def compare(
+    a: View, b: View, T_b_a: NDArray, camera: PinholeCamera | None = None, unit: float = 1.0
+) -> Fit:
     """The fit of two frames, each seen from the other."""
-    total = np.zeros(4)
-    for view, other, T in ((a, b, T_b_a), (b, a, se3.inverse(T_b_a))):
-        total += _count(view, other, T, camera)
-    points, agree, through, closeness = total
-    judged = agree + 2 * through  # what lies too deep is hidden, as often as it is seen through
-    if agree + through < MIN_POINTS:
+    there = _beyond(a, b, T_b_a, camera)
+    back = _beyond(b, a, se3.inverse(T_b_a), camera)
+    wanted, beyond = (np.concatenate(x) for x in zip(there, back, strict=True))
+    # how much farther a view sees, in tolerances
+    off = beyond / np.maximum(TOLERANCE * wanted, LEAST_TOLERANCE * unit)
+    agree, through = np.abs(off) < 1, int((off >= 1).sum())
+    told = int(agree.sum()) + through
+    if told < MIN_POINTS:
         return NOTHING
-    return Fit(agree / judged, closeness / judged, (agree + through) / max(points, 1))
+    judged = told + through  # what lies too deep is hidden, as often as it is seen through
+    return Fit(
+        agree.sum() / judged,
+        (1 - np.abs(off[agree])).sum() / judged,
+        told / max(len(a.z) + len(b.z), 1),
+        max(float(np.median(np.abs(beyond) / wanted)), LEAST_ERROR),
+    )
 
 
-def _count(
+def _beyond(
     view: View, other: View, T_other_view: NDArray, camera: PinholeCamera | None
-) -> NDArray[np.float64]:
-    """Points of a view, how many of them agree, how many another view looks through, and the sum
-    of their closeness.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depths [m] of a view's points in another one that measured something there, and how much
+    farther that is.
     """
     points = view.points(camera) if camera else view.own_points
     points = points @ T_other_view[:3, :3].T + T_other_view[:3, 3]
@@ -142,11 +167,7 @@ def _count(
     measured, inside = (camera or other.camera).look_up(other.depth, points, nearest)
     wanted = points[inside, 2]
     measured, wanted = measured[measured > 0], wanted[measured > 0]
-    # how much farther a view sees, in tolerances
-    beyond = (measured - wanted) / np.maximum(TOLERANCE * wanted, LEAST_TOLERANCE)
-    close = 1 - np.abs(beyond)
-    agree = close > 0
-    return np.array([len(points), agree.sum(), (beyond >= 1).sum(), close[agree].sum()])
+    return wanted, measured - wanted
 
 
 class EarlyPairs:

@@ -17,6 +17,7 @@ from tiny_recording import write_folder
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
 import doctor as bench
+import doctor_spoilings as spoilings
 
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets import open_dataset
@@ -40,9 +41,9 @@ def test_sound_frames_are_sound(frames):
     assert "160x120" in diagnosis.facts["depth"] and "12" in diagnosis.facts["frames"]
 
 
-@pytest.mark.parametrize("title", [title for title in bench.SPOILINGS if title not in NOT_SEEN])
+@pytest.mark.parametrize("title", [title for title in spoilings.SPOILINGS if title not in NOT_SEEN])
 def test_the_right_cause_is_named_and_no_other(frames, title):
-    spoiling = bench.SPOILINGS[title]
+    spoiling = spoilings.SPOILINGS[title]
     diagnosis = bench.examined(spoiling.change(frames), spoiling.depth_scale)
     named = {finding.cause for finding in diagnosis.findings}
     assert named == {spoiling.cause}, [finding.sentence for finding in diagnosis.findings]
@@ -50,7 +51,7 @@ def test_the_right_cause_is_named_and_no_other(frames, title):
 
 
 def test_answers_mend_what_they_were_given_for(frames, tmp_path, capsys):
-    spoiled = bench.by_pose(lambda T: np.linalg.inv(T @ FLIP_YZ))(bench.longer(100)(frames))
+    spoiled = spoilings.by_pose(lambda T: np.linalg.inv(T @ FLIP_YZ))(spoilings.longer(100)(frames))
     folder = write_folder(tmp_path / "r", spoiled)
     fix = tmp_path / "fix.yaml"
     assert cli.main(["check", "folder", str(folder), "--fix", str(fix)]) == 2
@@ -87,7 +88,7 @@ def test_frames_that_cannot_be_read_are_counted(frames, tmp_path):
 
 def test_how_far_colour_is_off(frames):
     for right, down in ((16, 0), (-20, 12)):
-        found = find_shift(bench.beside(right, down)(frames))
+        found = find_shift(spoilings.beside(right, down)(frames))
         # half of it in images 320 pixels wide; textures pull by a few pixels
         np.testing.assert_allclose(found, (right / 2, down / 2), atol=4)
     grey = [replace(f, color=np.full_like(f.color, 90)) for f in frames]

@@ -15,13 +15,16 @@ from .sampling import Sample
 
 WIDTH = 320  # [pixels] that frames are shrunk to
 REACH = 14  # [pixels of it] that colour may be off, in each direction
+NEAR = 2  # [pixels of it] that the edges of any sensor may be off
 JUMP = 0.08  # relative, of depth at an edge
-LEAST_EDGES = 150  # pixels of a frame
-LEAST_FRAMES, MOST_FRAMES = 2, 10
-LEAST_SHIFT = 2.0  # [pixels of WIDTH]
-CLEARLY = 0.12  # rank by which colour must change more at the edges, shifted
+LEAST_EDGES = 150  # pixels, of all frames together
+LEAST_SIDE = 40  # of these that face one way, for them to count
+MOST_FRAMES = 10
+CLEARLY, NOISE = (
+    0.06,
+    5.0,
+)  # rank by which colour must change more, shifted; and over the root of their number
 MOST = 0.7  # of the frames must say so
-STANDS_OUT = 0.15  # rank by which the best shift is ahead of the usual
 
 
 def color_findings(sample: Sample) -> list[Finding]:
@@ -48,30 +51,37 @@ def _said(pixels: float, positive: str, negative: str) -> str:
 def find_shift(frames: Sequence[Frame]) -> tuple[float, float] | None:
     """How far colour lies right of and below depth [pixels of WIDTH]; None where it fits, or edges do
     not tell.
+
+    Edges that face left, right, up and down count alike: colour that is beside depth is so at all of
+    them, while the front of a table has an edge of colour some pixels above that of its depth.
     """
     step = max(1, len(frames) // MOST_FRAMES)
-    scores = [score for frame in frames[::step] if (score := edge_scores(frame)) is not None]
-    if len(scores) < LEAST_FRAMES:
+    told = [scores for frame in frames[::step] if (scores := edge_scores(frame)) is not None]
+    if not told:
         return None
-    mean = np.mean(scores, axis=0)
+    counts = np.sum([count for count, _ in told], axis=0)
+    kept = counts >= LEAST_SIDE
+    if counts.sum() < LEAST_EDGES or not kept.any():
+        return None
+    sides = np.sum([total for _, total in told], axis=0)[kept] / counts[kept, None, None]
+    mean = sides.mean(axis=0)
     v, u = np.unravel_index(int(mean.argmax()), mean.shape)
-    shift = float(u - REACH), float(v - REACH)
-    if np.hypot(*shift) < LEAST_SHIFT:
+    if np.hypot(u - REACH, v - REACH) <= NEAR:
         return None
-    here = np.array([s[REACH, REACH] for s in scores])
-    there = np.array([s[v, u] for s in scores])
-    stands_out = mean.max() - np.median(mean)
-    gain = there - here
-    if gain.mean() < CLEARLY or (gain > 0).mean() < MOST or stands_out < STANDS_OUT:
+    near = slice(REACH - NEAR, REACH + NEAR + 1)
+    gain = mean[v, u] - mean[near, near].max()
+    frames_gain = [(total[:, v, u] - total[:, REACH, REACH]).sum() > 0 for _, total in told]
+    if gain < max(CLEARLY, NOISE / np.sqrt(counts.sum())) or np.mean(frames_gain) < MOST:
         return None
-    return shift
+    return float(u - REACH), float(v - REACH)
 
 
-def edge_scores(frame: Frame) -> NDArray[np.float64] | None:
-    """For every shift (2 REACH + 1, 2 REACH + 1), down and right, how much colour changes where depth
-    jumps, relative to its mean change; None where depth has too few edges.
+def edge_scores(frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+    """Where depth jumps, the number of pixels (4,) in front of the jump to their right, left, below and
+    above, and for every shift (4, 2 REACH + 1, 2 REACH + 1), down and right, how much colour changes
+    there relative to its mean change, summed; None without colour, or if all is of one.
     """
-    if frame.color is None:
+    if frame.color is None or np.ptp(frame.color) == 0:
         return None
     height = max(1, round(frame.camera.height * WIDTH / frame.camera.width))
     depth = cv2.resize(
@@ -80,29 +90,28 @@ def edge_scores(frame: Frame) -> NDArray[np.float64] | None:
         interpolation=cv2.INTER_NEAREST,
     )
     color = cv2.resize(frame.color, (WIDTH, height), interpolation=cv2.INTER_AREA)
-    edges = _depth_edges(np.asarray(depth, np.float32))
-    if edges.sum() < LEAST_EDGES:
-        return None
     change = _color_change(np.asarray(color, np.uint8))
-    v, u = np.nonzero(edges)
-    inside = (v >= REACH) & (v < height - REACH) & (u >= REACH) & (u < WIDTH - REACH)
-    v, u = v[inside], u[inside]
-    if len(v) < LEAST_EDGES:
-        return None
-    steps = range(-REACH, REACH + 1)
-    return np.array([[change[v + dv, u + du].mean() for du in steps] for dv in steps])
+    counts, totals = [], []
+    spectrum, steps = np.fft.rfft2(change), np.arange(-REACH, REACH + 1)
+    for edges in _depth_edges(np.asarray(depth, np.float32)):
+        edges[:REACH] = edges[-REACH:] = edges[:, :REACH] = edges[:, -REACH:] = False
+        counts.append(int(edges.sum()))
+        summed = np.fft.irfft2(np.conj(np.fft.rfft2(edges)) * spectrum, change.shape)
+        totals.append(summed[np.ix_(steps, steps)])
+    return np.array(counts), np.array(totals, np.float64)
 
 
-def _depth_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels in front of a jump of depth."""
-    edges = np.zeros(depth.shape, bool)
-    for axis in (0, 1):
+def _depth_edges(depth: NDArray[np.float32]) -> list[NDArray[np.bool_]]:
+    """Pixels in front of a jump of depth to their right, left, below and above."""
+    found = []
+    for axis in (1, 0):
         near, far = depth, np.roll(depth, -2, axis)
         both = (near > 0) & (far > 0)
-        edges |= both & (far > near * (1 + JUMP))
-        edges |= np.roll((near > far * (1 + JUMP)) & both, 2, axis)
-    edges[:2] = edges[-2:] = edges[:, :2] = edges[:, -2:] = False
-    return edges
+        found += [
+            both & (far > near * (1 + JUMP)),
+            np.roll(both & (near > far * (1 + JUMP)), 2, axis),
+        ]
+    return found
 
 
 def _color_change(color: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -38,6 +38,7 @@ class Finding:
     advice: str = ""  # what to do; empty where nothing needs to be done
     fix: Fix = field(default_factory=Fix)
     wrong: bool = True  # False: worth knowing, but the map is right without a change
+    rivals: tuple[str, ...] = ()  # other causes that the evidence fits as well
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ class Diagnosis:
             "findings": [
                 {
                     "cause": finding.cause,
+                    "rivals": list(finding.rivals),
                     "wrong": finding.wrong,
                     "sentence": finding.sentence,
                     "advice": finding.advice,

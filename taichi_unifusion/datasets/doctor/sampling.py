@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,27 @@ class Sample:
     asked: int
     times: NDArray[np.float64]  # (N,) [s] of all frames, NaN: not known
     poses: tuple[NDArray[np.float64] | None, ...]  # T_world_camera of all frames
+
+    @property
+    def timed(self) -> bool:
+        """Whether times and poses of all frames are known, of four at least, and times ascend."""
+        return len(self.times) == len(self.recording) and len(self.timed_poses[0]) >= 4
+
+    @cached_property
+    def timed_poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Ascending times (N,) [s] and poses (N, 4, 4) of the frames that have both; none where two
+        have the same time.
+        """
+        known = [
+            i
+            for i, (time, T) in enumerate(zip(self.times, self.poses, strict=True))
+            if np.isfinite(time) and T is not None
+        ]
+        order = sorted(known, key=lambda i: self.times[i])
+        times = self.times[order]
+        if (np.diff(times) <= 0).any():
+            return np.empty(0), np.empty((0, 4, 4))
+        return times, np.array([self.poses[i] for i in order]).reshape(-1, 4, 4)
 
     def neighbours(self) -> list[tuple[Frame, Frame]]:
         """Frames that follow each other at once."""

@@ -1,4 +1,4 @@
-"""Frames among each other: a camera that never moves, repeats, jumps of exposure, time stamps."""
+"""Frames among each other: a camera that never moves, repeats, time stamps; jumps of exposure."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...types import Frame
+from .exposure import exposure_findings
 from .finding import Finding
 from .sampling import Sample
 
@@ -15,13 +16,11 @@ LEAST_FRAMES = 4
 CHANGED = 4.0  # [grey levels] mean difference of pictures that show something else
 REPEATED_SHARE = 0.05  # of neighbouring frames; fewer are a camera's hiccup
 SMALL = (80, 60)  # [pixels] that pictures are compared at
-ALIKE = 0.7  # correlation of neighbouring pictures that show the same
-EXPOSURE = 1.25  # factor of brightness between neighbours
 
 
 def frame_findings(sample: Sample) -> list[Finding]:
     """Findings on frames as pictures, and on their times."""
-    found = [_still(sample), _repeated(sample), _exposure(sample), *_times(sample)]
+    found = [_still(sample), _repeated(sample), *exposure_findings(sample), *_times(sample)]
     return [finding for finding in found if finding is not None]
 
 
@@ -78,33 +77,6 @@ def _repeated(sample: Sample) -> Finding | None:
 def _equal(a: Frame, b: Frame) -> bool:
     colors = a.color is None or b.color is None or np.array_equal(a.color, b.color)
     return bool(colors and np.array_equal(a.depth, b.depth) and (a.depth > 0).any())
-
-
-def _exposure(sample: Sample) -> Finding | None:
-    jumps = []
-    for a, b in sample.neighbours():
-        if a.color is None or b.color is None:
-            continue
-        before, after = _small(a), _small(b)
-        if before.std() < 1 or after.std() < 1:
-            continue
-        if np.corrcoef(before.ravel(), after.ravel())[0, 1] < ALIKE:
-            continue
-        lit = (before > 8) & (after > 8) & (before < 247) & (after < 247)
-        if lit.sum() < before.size // 8:
-            continue
-        factor = float(np.median(after[lit] / before[lit]))
-        if max(factor, 1 / factor) > EXPOSURE:
-            jumps.append((b.index, factor))
-    if not jumps:
-        return None
-    index, factor = jumps[0]
-    return Finding(
-        "exposure",
-        f"brightness jumps between neighbouring frames {len(jumps)} times (first: {factor:.2f} times as bright at "
-        f"frame {index}); colours will be patchy",
-        "lock exposure and white balance of the camera; --start and --end leave frames out",
-    )
 
 
 def _times(sample: Sample) -> list[Finding]:
