@@ -18,6 +18,7 @@ from ..kernels.keeping import shrink_depth
 from ..runtime import DeviceArray
 from ..types import ImageView, PinholeCamera
 from .kept_cells import KeptCells, Levels
+from .lenses import through_lenses
 
 DEPTH_UNITS = 1000.0  # of a metre
 DEPTH_STEP = 2  # pixels from one that is kept to the next
@@ -31,12 +32,17 @@ class KeptViews:
     """The depth images of a window, small and in whole millimetres; all of them vote."""
 
     depth: NDArray[np.uint16]  # (K, h, w) [mm] 0: no reading
-    camera: PinholeCamera  # of these images
+    camera: PinholeCamera  # of the first of these images
     T_keyframe_camera: NDArray[np.float64]  # (K, 4, 4)
+    lenses: NDArray[np.float64]  # (K, 4) as `lens_beside` has them
 
     @classmethod
     def of(
-        cls, images: DeviceArray, camera: PinholeCamera, T_keyframe_camera: NDArray[np.float64]
+        cls,
+        images: DeviceArray,
+        camera: PinholeCamera,
+        T_keyframe_camera: NDArray[np.float64],
+        lenses: NDArray[np.float64],
     ) -> KeptViews:
         """The first images (K, H, W) [m] of a window; of each row and column every DEPTH_STEPth."""
         n, (height, width) = len(T_keyframe_camera), images.shape[1:]
@@ -50,7 +56,7 @@ class KeptViews:
             camera.cx / DEPTH_STEP,
             camera.cy / DEPTH_STEP,
         )
-        return cls(depth, small, T_keyframe_camera)
+        return cls(depth, small, T_keyframe_camera, lenses)
 
     @property
     def meters(self) -> NDArray[np.float32]:
@@ -58,9 +64,8 @@ class KeptViews:
         return self.depth.astype(np.float32) / np.float32(DEPTH_UNITS)
 
     def T_camera_world(self, T_world_keyframe: NDArray[np.float64]) -> NDArray[np.float32]:
-        """(K, 3, 4) with the keyframe at a pose."""
-        T = inverse(T_world_keyframe @ self.T_keyframe_camera)
-        return np.ascontiguousarray(T[:, :3], np.float32)
+        """(K, 3, 4) with the keyframe at a pose, as its camera would have to see them."""
+        return through_lenses(inverse(T_world_keyframe @ self.T_keyframe_camera), self.lenses)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from ..kernels.patches import Patches, Targets
 from ..runtime import Arena, DeviceArray
 from ..types import Frame, PinholeCamera
 from .kept_window import KeptCells, KeptFeatures, KeptViews, KeptWindow
+from .lenses import lens_beside, nearly_same, through_lenses
 from .local_lim import CellArrays, OpenCells
 from .property_group import MapGroup, Part
 from .regression_map import RegressionMap
@@ -79,16 +80,17 @@ class OpenPart:
 @dataclass
 class Window:
     """Frames that are summed up. The first one is the keyframe; all carry the same, and were taken
-    by the same camera.
+    by the same camera, whose focal length and centre may change a little, as with autofocus.
     """
 
     T_world_keyframe: NDArray[np.float64]
-    camera: PinholeCamera
+    camera: PinholeCamera  # of the keyframe
     carried: frozenset[str]  # what each frame carries
     images: DeviceArray  # (K, H, W) [m] depth of the views
     parts: dict[tuple[str, ...], OpenPart]  # by the names of their maps
     others: bool  # whether other maps want patches too
     T_camera_world: list[NDArray[np.float64]] = field(default_factory=list)  # of the views
+    lenses: list[NDArray[np.float64]] = field(default_factory=list)  # as `lens_beside` has them
     frames: list[int] = field(default_factory=list)  # their places in the recording
     features: list[KeptFeatures] = field(default_factory=list)  # that they brought to other maps
 
@@ -106,7 +108,7 @@ class Window:
         """Whether a frame was taken by the same camera from about the same place."""
         moved, turned = distance(self.T_world_keyframe, frame.require_pose())
         near = moved <= FARTHEST_MOVE and np.degrees(turned) <= LARGEST_TURN
-        return near and frame.camera == self.camera
+        return near and nearly_same(frame.camera, self.camera)
 
     def has_room_for(self, frame: Frame) -> bool:
         """Whether the values of a frame are of a size that can be summed with those before."""
@@ -143,6 +145,7 @@ class Window:
             if each not in direct:
                 each.part.binner.add(each.cells, patches, each.part.carried(patches), len(self))
         self.T_camera_world.append(inverse(frame.require_pose()))
+        self.lenses.append(lens_beside(frame.camera, self.camera))
         self.frames.append(frame.index)
         touched = {
             name: each.cells.count - before[names].count
@@ -214,13 +217,13 @@ class Window:
 
     def _kept(self, cells: Mapping[tuple[str, ...], KeptCells]) -> KeptWindow:
         T_keyframe_camera = inverse(np.array(self.T_camera_world) @ self.T_world_keyframe)
-        views = KeptViews.of(self.images, self.camera, T_keyframe_camera)
+        views = KeptViews.of(self.images, self.camera, T_keyframe_camera, np.array(self.lenses))
         frames, features = tuple(self.frames), tuple(self.features)
         return KeptWindow(frames, self.T_world_keyframe, cells, views, features)
 
     def _poses(self) -> NDArray[np.float32]:
-        """(K, 3, 4) T_camera_world of the views."""
-        return np.array([T[:3] for T in self.T_camera_world], np.float32)
+        """(K, 3, 4) T_camera_world of the views, as the keyframe's camera would have to see them."""
+        return through_lenses(np.array(self.T_camera_world), np.array(self.lenses))
 
     def _pieces(self, part: OpenPart) -> Iterator[Piece]:
         name, encoder = " + ".join(part.part.names), part.part.encoder
@@ -245,8 +248,8 @@ class Window:
 
 
 class WindowFusion:
-    """Sums frames up in windows of `size` frames at most, and fuses full ones piece by piece while
-    the next one fills, so that no frame of a video waits for a whole window.
+    """Sums frames up in windows of `size` frames at most, and fuses full ones piece by piece while the
+    next one fills, so that no frame of a video waits for a whole window.
 
     A size of 1 fuses every frame by itself, at once. `keep` is told of every window that was fused,
     so that it can be taken out; `settle` is called whenever one was closed, before it is fused: then

@@ -194,6 +194,7 @@ def to_record(window: KeptWindow) -> tuple[dict[str, Any], dict[str, NDArray]]:
         "T_world_keyframe": window.T_world_keyframe.tolist(),
         "T_keyframe_camera": window.views.T_keyframe_camera.tolist(),
         "camera": _camera_values(window.views.camera),
+        "lenses": window.views.lenses.tolist(),
         "parts": parts,
         "features": features,
     }
@@ -202,10 +203,13 @@ def to_record(window: KeptWindow) -> tuple[dict[str, Any], dict[str, NDArray]]:
 
 def from_record(values: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> KeptWindow:
     """The window that `to_record` gave."""
+    T_keyframe_camera = np.array(values["T_keyframe_camera"], np.float64).reshape(-1, 4, 4)
+    same = [[1.0, 1.0, 0.0, 0.0]] * len(T_keyframe_camera)  # results of before have one lens
     views = KeptViews(
         arrays["depth"],
         PinholeCamera(*values["camera"]),
-        np.array(values["T_keyframe_camera"], np.float64).reshape(-1, 4, 4),
+        T_keyframe_camera,
+        np.array(values.get("lenses", same), np.float64).reshape(-1, 4),
     )
     cells = {
         tuple(part["names"]): _get_cells(f"part{i}", part, arrays)

@@ -64,7 +64,7 @@ def test_a_window_ends_at_a_gap_in_the_recording(frames):
 
 
 def test_a_window_ends_where_another_camera_takes_over(frames):
-    other = PinholeCamera(64, 48, 55.0, 55.0, 30.0, 23.5)
+    other = PinholeCamera(64, 48, 66.0, 66.0, 31.5, 23.5)
     smaller = PinholeCamera(48, 36, 41.25, 41.25, 23.5, 17.5)
     for camera in (other, smaller):
         taken = [frames[0], frames[1], *walk(4, camera=camera)[2:]]
