@@ -83,10 +83,8 @@ COMMANDS: Commands = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    argv, debug = (
-        list(sys.argv[1:] if argv is None else argv),
-        bool(os.environ.get("UNIFUSION_DEBUG")),
-    )
+    argv = [_american(word) for word in (sys.argv[1:] if argv is None else argv)]
+    debug = bool(os.environ.get("UNIFUSION_DEBUG"))
     with log_to_stderr(debug):
         try:
             code = _dispatch(argv)
@@ -115,6 +113,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             if debug or (known := as_known(error)) is error:
                 raise
             return report([known])
+
+
+def _american(word: str) -> str:
+    """An option as it is spelled here: --colour-camera is --color-camera; its value stays."""
+    if not word.startswith("--"):
+        return word
+    name, equals, value = word.partition("=")
+    return f"{name.replace('colour', 'color')}{equals}{value}"
 
 
 def _dispatch(argv: list[str]) -> int:

@@ -15,7 +15,7 @@ from tyro.conf import arg
 from ..cluster.engine import ClusterSettings
 from ..config import Config
 from ..datasets import Dataset
-from ..errors import InputError
+from ..errors import InputError, PoseError
 from ..geometry.gravity import Up, parse_up
 from ..tracking import check_poses, track
 from ..tracking.sequence import PosedFrames
@@ -306,6 +306,8 @@ def _map(
 
 def _report_missing(run: RunResult, frames: int) -> int:
     """Say how many of the frames are not in the map; FAILED where these are most of those tried."""
+    from ..run_log import SKIP_REASONS
+
     missing = frames - len(run.steps)
     if not missing:
         return DONE
@@ -314,12 +316,14 @@ def _report_missing(run: RunResult, frames: int) -> int:
         kinds["not reached"] = not_reached
     reasons = ", ".join(f"{count} {reason}" for reason, count in kinds.most_common())
     few = len(run.skipped) >= len(run.steps)
+    unposed = kinds[SKIP_REASONS[PoseError]] > len(run.steps)
     logger.log(
         logging.ERROR if few else logging.WARNING,
-        "%d of %d frames are not in the map: %s",
+        "%d of %d frames are not in the map: %s%s",
         missing,
         frames,
         reasons,
+        "; --tracking rgbd finds poses from the frames alone" if unposed else "",
     )
     return FAILED if few else DONE
 

@@ -133,6 +133,7 @@ def open_dataset(format: str, path: str | Path | None = None, **options: Any) ->
     format = known_format(format, path)
     opener = _opener(format)
     known = format_options(format)
+    options = {american(name): value for name, value in options.items()}
     for option, value in options.items():
         _check_option(option, format, known)
         if option not in MENDINGS:
@@ -161,7 +162,15 @@ def _open(
     path = as_path(f"path of a recording, format '{format}'", path).expanduser()
     if not os.path.exists(path):  # unlike Path.exists it answers for any name
         raise DatasetError(f"{path}: no such file or folder")
-    return opener(path, **options)
+    try:
+        return opener(path, **options)
+    except DatasetError as error:
+        from .detection import other_format
+
+        hint = other_format(path, format, FORMATS)
+        if not hint:
+            raise
+        raise DatasetError(f"{error}{hint}") from error
 
 
 def known_format(format: str, path: str | Path | None) -> str:
@@ -218,6 +227,7 @@ def parse_options(format: str, texts: Iterable[str]) -> dict[str, Any]:
     options: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
+        name = american(name)
         if not equals:
             raise InputError(f"option '{text}': give it as NAME=VALUE")
         _check_option(name, format, known)
@@ -230,6 +240,11 @@ def parse_options(format: str, texts: Iterable[str]) -> dict[str, Any]:
             continue
         options[name] = convert(value, known[name].type, f"option '{name}'")
     return options
+
+
+def american(name: str) -> str:
+    """The name of an option as it is spelled here: `colour_topic` is `color_topic`."""
+    return name.replace("colour", "color")
 
 
 def _opener(format: str) -> Callable[..., Dataset]:

@@ -24,6 +24,7 @@ DEVICE_TOPIC = b"/device_0/"  # of the RealSense SDK
 CALIBRATION = b"calibration.json"  # attached by k4arecorder, before the images
 ZIP, MATROSKA = b"PK\x03\x04", b"\x1a\x45\xdf\xa3"
 BAG, MCAP, SQLITE = b"#ROSBAG V2.0", b"\x89MCAP", b"SQLite format 3\0"
+PACKED, PACKED_BAG = b"\x28\xb5\x2f\xfd", r"\.(bag|db3|mcap)\.zstd?$"  # Zstandard
 MESHES = (".glb", ".gltf", ".obj", ".ply")
 
 
@@ -218,7 +219,10 @@ def _rosbag(place: Place) -> str:
         return "an .mcap file"
     if place.head.startswith(SQLITE) and place.suffix == ".db3":
         return "" if _has_device_topics(place) else "a .db3 bag of ROS 2"
-    bag = place.has(r".*\.(db3|mcap)") if "metadata.yaml" in place.names else ""
+    if place.head.startswith(PACKED) and re.search(PACKED_BAG, place.path.name):
+        return "a bag that is packed as a whole"
+    pattern = rf".*(\.db3|\.mcap|{PACKED_BAG})"
+    bag = place.has(pattern) if "metadata.yaml" in place.names else ""
     return f"metadata.yaml and {bag}" if bag else ""
 
 
@@ -288,6 +292,16 @@ def find_format(path: Path, formats: Collection[str]) -> Finding:
             f"{path}: could be {said}; write the one that is meant instead of 'auto'"
         )
     raise DatasetError(f"{path}: {_nothing_found(Place(path), formats)}")
+
+
+def other_format(path: Path, format: str, formats: Collection[str]) -> str:
+    """The end of a sentence about a recording that is none of this format: which one it is instead, as
+    its files say; nothing where they do not say it.
+    """
+    found = [each for each in _findings(Place(path), formats) if each.format != format]
+    if len(found) != 1 or len(_findings(Place(path), (format,))):
+        return ""
+    return f"; these look like files of format '{found[0].format}' ({found[0].sign}): give that instead of '{format}'"
 
 
 def _findings(place: Place, formats: Collection[str]) -> list[Finding]:

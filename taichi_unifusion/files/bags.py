@@ -20,6 +20,7 @@ from ..errors import DatasetError, FrameError
 from .chunked_bag import BagTopic, missing_rosbags, zstd
 from .frame_files import in_order
 from .mcap_container import Mcap
+from .packed_files import PACKED, Scratch
 from .rosbag1_container import Rosbag1
 from .sqlite_bag import SqliteBag
 
@@ -53,12 +54,14 @@ class Bag:
     """A bag, opened: `topics` by name, `damage` says where it was cut off."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self._scratch = path, Scratch()
         files, self._packed = _files_of(path)
         self._parts: list[Container] = []
         problems: list[str] = []
         for file in files:
             try:
+                file, problem = self._scratch.unpacked(file)
+                problems += [problem] if problem else []
                 self._parts.append(CONTAINERS[file.suffix.lower()](file))
             except DatasetError as error:  # one part of a recording may be lost
                 problems.append(str(error))
@@ -134,6 +137,7 @@ class Bag:
         """Give the files back."""
         for part in self._parts:
             part.close()
+        self._scratch.close()
 
     def _received(self, topic: str, index: int) -> int:
         part = int(np.searchsorted(self._starts[topic], index, side="right")) - 1
@@ -183,20 +187,27 @@ class _Decoder:
 def _files_of(path: Path) -> tuple[list[Path], bool]:
     """The files of a bag in their order, and whether each message is compressed by itself."""
     if not os.path.isdir(path):
-        if path.suffix.lower() not in CONTAINERS:
+        if bare_name(path.name) is None:
             raise DatasetError(
-                f"{path}: a bag is a .bag, .db3 or .mcap file, or a folder that holds such files"
+                f"{path}: a bag is a .bag, .db3 or .mcap file, packed by zstd or not, or a folder that holds such files"
             )
         return [path], False
-    names = sorted(os.listdir(path))
-    found = [path / name for name in names if Path(name).suffix.lower() in CONTAINERS]
-    if not found and any(name.endswith(".zstd") for name in names):
-        raise DatasetError(f"{path}: its files are compressed as a whole; unpack them with zstd -d")
+    # one that is unpacked already comes before the packed one
+    found = {
+        bare: path / name
+        for name in sorted(os.listdir(path), reverse=True)
+        if (bare := bare_name(name)) is not None
+    }
     if not found:
         raise DatasetError(f"{path}: no .bag, .db3 or .mcap file here")
-    by_name = {file.name: file for file in found}
     packed = _compression(path / "metadata.yaml") == "message"
-    return [by_name[name] for name in in_order(by_name)], packed  # x_2 before x_10
+    return [found[name] for name in in_order(found)], packed  # x_2 before x_10
+
+
+def bare_name(name: str) -> str | None:
+    """The name of a bag's file without what says that it is packed; None for other files."""
+    bare = Path(name).with_suffix("") if Path(name).suffix.lower() in PACKED else Path(name)
+    return str(bare) if bare.suffix.lower() in CONTAINERS else None
 
 
 def _compression(description: Path) -> str:

@@ -55,6 +55,23 @@ def test_what_phones_write_is_found(tmp_path, name):
     assert len(open_dataset("auto", path)) == 1
 
 
+@pytest.mark.parametrize(("given", "name"), [("replica", "7scenes"), ("folder", "tum")])
+def test_a_recording_of_another_format_says_which(tmp_path, given, name):
+    path = WRITTEN[name][1](tmp_path / "scene", make_samples())
+    with pytest.raises(
+        DatasetError, match=f"look like files of format '{name}'.*instead of '{given}'"
+    ):
+        open_dataset(given, path)
+
+
+def test_a_broken_recording_of_the_right_format_says_what_is_broken(tmp_path):
+    path = WRITTEN["tum"][1](tmp_path / "scene", make_samples())
+    (path / "rgb.txt").write_text("")
+    with pytest.raises(DatasetError) as told:
+        open_dataset("tum", path)
+    assert "look like files" not in str(told.value)
+
+
 def test_a_kinect_is_told_from_another_video(tmp_path):
     pytest.importorskip("av")
     path = k4a_writer.write_k4a(tmp_path / "a.mkv", 1)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets import (
     FORMATS,
     SENTENCES,
@@ -45,6 +46,13 @@ def test_every_option_has_a_sentence_and_no_sentence_is_left():
 )
 def test_options_from_text(format, texts, options):
     assert parse_options(format, texts) == options
+
+
+def test_colour_may_be_written_so():
+    assert parse_options("rosbag", ["colour_topic=none"]) == {"color_topic": "none"}
+    with pytest.raises(InputError, match="given twice"):
+        parse_options("rosbag", ["colour_topic=a", "color_topic=b"])
+    assert cli.main(["check", "synthetic", "--end", "2", "--colour-camera=none"]) == 0
 
 
 def test_options_from_text_open_a_recording():

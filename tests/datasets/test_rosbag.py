@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import builtins
+import tempfile
+from pathlib import Path
 
 import bag_writer as bags
 import cv2
@@ -10,8 +12,9 @@ import numpy as np
 import pytest
 from dataset_writers import CAMERA, PERIOD, START, make_pose, make_samples
 
-from taichi_unifusion.datasets import open_dataset
+from taichi_unifusion.datasets import known_format, open_dataset
 from taichi_unifusion.errors import DatasetError, FrameError, MissingDependency, PoseError
+from taichi_unifusion.files import packed_files
 from taichi_unifusion.types import PinholeCamera
 
 pytest.importorskip("rosbags", reason="bags are read with rosbags, extra 'ros'")
@@ -334,6 +337,43 @@ def test_without_rosbags_one_sentence_says_what_to_install(samples, tmp_path, mo
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MissingDependency, match=r"pip install 'taichi-unifusion\[ros\]'"):
         open_dataset("rosbag", path)
+
+
+def pack(folder: Path, container: str, cut: int | None = None) -> Path:
+    """As `ros2 bag record --compression-mode file` leaves it."""
+    from backports import zstd
+
+    (file,) = folder.glob(f"*.{container}")
+    file.with_name(f"{file.name}.zstd").write_bytes(zstd.compress(file.read_bytes())[:cut])
+    file.unlink()
+    (folder / "metadata.yaml").write_text("compression_mode: FILE\ncompression_format: zstd\n")
+    return folder
+
+
+@pytest.mark.parametrize("container", ["db3", "mcap"])
+def test_bags_that_are_packed_as_a_whole(container, samples, tmp_path, monkeypatch):
+    """Unpacked into a temporary folder, which is gone when the bag is closed."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = bags.write_bag(tmp_path / "recording", bags.recording(samples), container)
+    pack(folder, container)
+    for path in (folder, next(folder.glob("*.zstd"))):
+        assert known_format("auto", path) == "rosbag"
+        dataset = open_dataset("rosbag", path)
+        check_frames(dataset, samples)
+        assert len(list(tmp_path.glob("unifusion-*"))) == 1
+        dataset.bag.close()
+        assert not list(tmp_path.glob("unifusion-*"))
+
+
+def test_a_packed_bag_that_is_damaged_or_a_bomb_is_refused(samples, tmp_path, monkeypatch):
+    folder = bags.write_bag(tmp_path / "recording", bags.recording(samples), "db3")
+    with pytest.raises(DatasetError, match="damaged or cut off"):
+        open_dataset("rosbag", pack(folder, "db3", cut=20))
+    monkeypatch.setattr(packed_files, "MOST_TIMES", 0)
+    monkeypatch.setattr(packed_files, "MOST_MORE", 1000)
+    folder = bags.write_bag(tmp_path / "other", bags.recording(samples), "db3")
+    with pytest.raises(DatasetError, match="taken for damaged"):
+        open_dataset("rosbag", pack(folder, "db3"))
 
 
 @pytest.mark.parametrize("container", bags.CONTAINERS)
