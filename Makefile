@@ -17,10 +17,10 @@ demo:
 test: setup
 	.venv/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
-# Every reader of files gets 20,000 mutated ones, recordings 2,000; FUZZ="-k png" chooses.
+# Every reader of files gets 20,000 mutated ones, recordings and lists of poses 2,000; FUZZ="-k png" chooses.
 fuzz: setup
 	UNIFUSION_FUZZ=20000 .venv/bin/python -m pytest -n $(WORKERS) tests/fuzz/test_fuzz.py $(FUZZ)
-	UNIFUSION_FUZZ=2000 .venv/bin/python -m pytest -n $(WORKERS) tests/fuzz/test_readers.py $(FUZZ)
+	UNIFUSION_FUZZ=2000 .venv/bin/python -m pytest -n $(WORKERS) tests/fuzz/test_readers.py tests/fuzz/test_phones.py $(FUZZ)
 
 # Ten thousand frames of one scene: memory must not grow.
 soak: setup

@@ -43,6 +43,12 @@ def plain_bag(folder: Path, container: str) -> Path:
     return bags.write_bag(folder / "r", bags.recording(make_samples(3)), container)
 
 
+def lone_file(folder: Path, container: str) -> Path:
+    """A .db3 without the metadata.yaml beside it, as a robot that was switched off leaves it."""
+    (file,) = plain_bag(folder, container).glob(f"*.{container}")
+    return file.rename(folder / file.name)
+
+
 def realsense(folder: Path, container: str) -> Path:
     return write_realsense(folder / "r", container, inverse=container == "db3")
 
@@ -61,6 +67,7 @@ RECORDINGS = {
     "mcap": ("rosbag", plain_bag, "mcap"),
     "mcap zstd": ("rosbag", plain_bag, "mcap-zstd"),
     "db3": ("rosbag", plain_bag, "db3"),
+    "db3 alone": ("rosbag", lone_file, "db3"),
     "encodings in a bag": ("rosbag", bag_of_all_encodings, "bag"),
     "encodings in a db3": ("rosbag", bag_of_all_encodings, "db3"),
     "realsense db3": ("realsense", realsense, "db3"),
