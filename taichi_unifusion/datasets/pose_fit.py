@@ -72,7 +72,8 @@ class PosePairs:
 
     def __init__(self, frames: Sequence[Frame], pairs: Sequence[tuple[int, int]]) -> None:
         self.views = [View(frame) for frame in frames]
-        self.T_world_camera = np.stack([frame.require_pose() for frame in frames])
+        poses = [frame.require_pose() for frame in frames]
+        self.T_world_camera = np.array(poses, np.float64).reshape(-1, 4, 4)
         self.pairs = tuple(pairs)
 
     def fits(

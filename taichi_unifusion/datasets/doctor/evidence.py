@@ -141,13 +141,14 @@ class Evidence:
             times, poses = self.sample.timed_poses
             nothing = np.full((4, 4), np.nan)
             found = [pose_at_time(times, poses, float(time) + offset) for time in self.at]
-            self.poses_at[offset] = np.stack([nothing if T is None else T for T in found])
+            usable = [nothing if T is None else T for T in found]
+            self.poses_at[offset] = np.array(usable).reshape(-1, 4, 4)
         return self.poses_at[offset]
 
     def _changed(self, offset: float) -> NDArray[np.bool_]:
         """In which pairs of `moments` the way between the frames is another at that offset."""
         T, given = self.moved(offset), self.moments.T_world_camera
-        a, b = np.array(self.moments.pairs).T
+        a, b = np.array(self.moments.pairs, int).reshape(-1, 2).T
         change = (se3.inverse(T[b]) @ T[a]) @ se3.inverse(se3.inverse(given[b]) @ given[a])
         way = np.linalg.norm(change[:, :3, 3], axis=1)
         turn = np.linalg.norm(change[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2)
