@@ -81,19 +81,24 @@ class Evidence:
             self.scored[key] = errors
         return self.scored[key]
 
-    def gains(self, change: Change, like: Change | None = None) -> NDArray[np.float64]:
-        """By how much every pair that tells gains by a change; of those that tell of another."""
-        in_time = bool((like or change).offset)
+    def gains(self, change: Change) -> NDArray[np.float64]:
+        """By how much every pair that tells gains by a change."""
+        in_time = bool(change.offset)
         before, after = self.errors(Change(), in_time), self.errors(change, in_time)
         told = np.isfinite(after) & ((before != 0) | (after != 0))
-        if like is not None:
-            told &= np.isfinite(self.errors(like, in_time))
         return np.clip((before - after)[told], -MOST_GAIN, MOST_GAIN)
 
-    def gain(self, change: Change, like: Change | None = None) -> float:
+    def gain(self, change: Change) -> float:
         """The mean of `gains`; -MOST_GAIN where no pair tells, or one alone of a clock."""
-        gains = self.gains(change, like)
+        gains = self.gains(change)
         return float(gains.mean()) if len(gains) > bool(change.offset) else -MOST_GAIN
+
+    def remaining(self, change: Change, like: Change | None = None) -> float:
+        """The mean logarithm of the difference that is left with a change, in the pairs that tell."""
+        in_time = bool((like or change).offset)
+        errors = self.errors(change, in_time)
+        told = np.isfinite(errors) & np.isfinite(self.errors(like or change, in_time))
+        return float(errors[told].mean()) if told.any() else 0.0
 
     def own(self, change: Change) -> tuple[Fit, Fit]:
         """How well near pairs fit, with and without a change; those that tell if it is a clock's."""
@@ -122,7 +127,7 @@ class Evidence:
         return gains.mean() >= max(LEAST_GAIN, sure) and (gains > 0).mean() >= MOSTLY
 
     def agreement(self, change: Change) -> str:
-        """How well depth agrees without and with a change, as the start of a sentence."""
+        """How well depth agrees with a change and without, as the start of a sentence."""
         fit, given = self.own(change)
         after, before = (
             np.exp(self.errors(each, bool(change.offset))) for each in (change, Change())
@@ -130,8 +135,8 @@ class Evidence:
         told = np.isfinite(after)
         differs = (float(np.median(e[told])) if told.any() else 1.0 for e in (before, after))
         return (
-            f"depth agrees with the poses on {given.share:.0%} of the points, on {fit.share:.0%} (between frames far "
-            "apart it differs by {:.2%}, then by {:.2%})".format(*differs)
+            f"depth agrees with the poses on {fit.share:.0%} of the points instead of {given.share:.0%}, and differs "
+            "by {1:.2%} instead of {0:.2%} between frames far apart,".format(*differs)
         )
 
     def moved(self, offset: float) -> NDArray[np.float64]:

@@ -80,16 +80,17 @@ def _named(evidence: Evidence, verdict: PoseVerdict, centre: Finding | None) -> 
 
 
 def _with_rivals(evidence: Evidence, named: list[Named]) -> Finding:
-    """The finding whose change gains most, and in words those of other causes that gain as much."""
+    """The finding whose change leaves the least difference, and in words those of other causes that leave
+    as little.
+    """
     clocks = [change for change, _ in named if change.offset]
     like = clocks[0] if clocks else None  # all on the same pairs
-    ranked = sorted(named, key=lambda each: -evidence.gain(each[0], like))
-    change, first = ranked[0]
+    ranked = sorted(named, key=lambda each: evidence.remaining(each[0], like))
+    least, first = evidence.remaining(ranked[0][0], like), ranked[0][1]
     rivals = [
         finding
         for other, finding in ranked[1:]
-        if finding.cause != first.cause
-        and evidence.gain(other, like) > evidence.gain(change, like) - RIVAL
+        if finding.cause != first.cause and evidence.remaining(other, like) < least + RIVAL
     ]
     if not rivals:
         return first
