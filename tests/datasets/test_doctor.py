@@ -93,3 +93,33 @@ def test_how_far_colour_is_off(frames):
         np.testing.assert_allclose(found, (right / 2, down / 2), atol=4)
     grey = [replace(f, color=np.full_like(f.color, 90)) for f in frames]
     assert find_shift(grey) is None
+
+
+def smaller(frames, factor: float):
+    """The same scene as a model of it: depth and ways shorter by a factor."""
+    return spoilings.longer(factor)(spoilings.deeper(factor)(frames))
+
+
+def test_a_unit_of_depth_is_found_in_a_scene_as_near_as_a_table(frames):
+    """Five times as deep, it looks like a room."""
+    near = smaller(frames, 0.15)
+    assert bench.examined(near).sound
+    (found,) = bench.examined(spoilings.deeper(5)(near), depth_scale=200.0).findings
+    assert found.cause == "depth-scale" and found.fix.recording == {"depth_scale": 1000.0}
+
+
+def test_where_both_units_are_usual_both_are_said(frames):
+    (found,) = bench.examined(spoilings.deeper(0.2)(frames), depth_scale=5000.0).findings
+    assert {found.cause, *found.rivals} == {"depth-scale", "pose-scale"}
+    assert "--depth-scale 1000" in found.advice and "--pose-scale" in found.advice
+
+
+def test_a_jump_of_exposure_to_white_is_found_and_a_slow_change_is_none(frames):
+    bright = [replace(f, color=(155 + f.color // 3).astype(np.uint8)) for f in frames]
+    jump = spoilings.SPOILINGS["jump of exposure"].change(bright)
+    assert bench.causes(bench.examined(jump)) == {"exposure"}
+    slow = [
+        replace(f, color=(f.color * (0.7 + 0.3 * i / len(frames))).astype(np.uint8))
+        for i, f in enumerate(frames)
+    ]
+    assert bench.examined(slow).sound
