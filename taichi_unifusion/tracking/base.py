@@ -75,6 +75,7 @@ class Verdict(StrEnum):
     RELOCALISED = "relocalised"  # after a loss: found at some keyframe by its features
     REFINED = "refined"  # aligned to earlier frames, close to the pose that was given
     PRIOR_KEPT = "prior kept"  # the pose that was given: the refinement could not be trusted
+    APART = "apart"  # no pose in the world yet: in a sub-map that has not met the first
     LOST = "lost"  # no pose: the frame does not fit what was seen before
     MISSING = "no pose"  # none was given
     UNREADABLE = "unreadable"  # the frame could not be loaded
@@ -92,6 +93,8 @@ class TrackedFrame:
     rmse: float | None = None  # of their distances [m]
     keyframe: int | None = None  # place in the recording of the frame that it was aligned to
     message: str = ""  # why a pose is missing or not trusted
+    # (4, 4) of a frame that is apart: where it lies in its sub-map, whose place is a mere guess
+    T_apart_camera: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

@@ -50,23 +50,37 @@ class Keyframes:
 
     def __init__(self) -> None:
         self.items: list[Keyframe] = []
+        self.islands: list[
+            int
+        ] = []  # the sub-map that each belongs to; 0: the first, whose is the world
         self.T_world_keyframe: list[NDArray[np.float64]] = []
         self.pyramids: OrderedDict[int, SurfelPyramid] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self.items)
 
-    def add(self, keyframe: Keyframe, pyramid: SurfelPyramid, T_world_keyframe: NDArray) -> int:
-        """Keep a keyframe; returns its number."""
-        number = self.append(keyframe, T_world_keyframe)
+    def add(
+        self,
+        keyframe: Keyframe,
+        pyramid: SurfelPyramid,
+        T_world_keyframe: NDArray,
+        island: int = 0,
+    ) -> int:
+        """Keep a keyframe of a sub-map; returns its number."""
+        number = self.append(keyframe, T_world_keyframe, island)
         self._remember(number, pyramid)
         return number
 
-    def append(self, keyframe: Keyframe, T_world_keyframe: NDArray) -> int:
+    def append(self, keyframe: Keyframe, T_world_keyframe: NDArray, island: int = 0) -> int:
         """Keep a keyframe whose pyramid is built when it is asked for; returns its number."""
         self.items.append(keyframe)
+        self.islands.append(island)
         self.T_world_keyframe.append(T_world_keyframe)
         return len(self.items) - 1
+
+    def same_island(self, number: int, others: range) -> list[int]:
+        """Those of `others` that belong to the sub-map of keyframe `number`."""
+        return [other for other in others if self.islands[other] == self.islands[number]]
 
     def pyramid(self, number: int) -> SurfelPyramid:
         """The surfel pyramid of keyframe `number`."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +26,8 @@ LOOP_CORRECTION = 0.3, np.radians(15)  # [m, rad] a result farther from its gues
 
 def neighbor_edges(keyframes: Keyframes, number: int, photometric_weight: float) -> list[Edge]:
     """Edges of a keyframe to recent ones, besides the previous."""
-    recent = _by_overlap(keyframes, number, range(max(0, number - NEAR), number - 1))
+    near = keyframes.same_island(number, range(max(0, number - NEAR), number - 1))
+    recent = _by_overlap(keyframes, number, near)
     return [
         edge
         for other in recent[:NEIGHBORS]
@@ -38,7 +41,7 @@ def find_loops(
     """Edges of a keyframe to older ones: to those that it should see if its pose is right, or, if
     there is none, to those that look like it.
     """
-    older = range(max(0, number - NEAR))
+    older = keyframes.same_island(number, range(max(0, number - NEAR)))
     edges = [
         edge
         for other in _by_overlap(keyframes, number, older)[:LOOPS]
@@ -46,7 +49,8 @@ def find_loops(
     ]
     if by_appearance and not edges:
         features = keyframes.items[number].features
-        for other in most_similar(features, [keyframes.items[k].features for k in older], LOOPS):
+        stored = [keyframes.items[k].features for k in older]
+        for other in (older[i] for i in most_similar(features, stored, LOOPS)):
             guess = locate(features, keyframes.items[other].features)
             if (
                 guess is not None
@@ -67,7 +71,7 @@ def _reachable(keyframes: Keyframes, other: int, number: int, T_other_number: ND
     return bool(drift < DRIFT[0] + DRIFT[1] * way)
 
 
-def _by_overlap(keyframes: Keyframes, number: int, others: range) -> list[int]:
+def _by_overlap(keyframes: Keyframes, number: int, others: Sequence[int]) -> list[int]:
     """Those of `others` that overlap the keyframe by the poses as they are, most first."""
     found = []
     for other in others:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,7 +17,7 @@ from .base import CurrentPoses, TrackedFrame, TrackingResult, TrackingSettings, 
 from .features import Features, extract_features
 from .keyframes import Keyframe, Keyframes
 from .loop_closure import find_loops, neighbor_edges
-from .pose_graph import Edge, Prior, optimize
+from .pose_graph import ANCHOR, Edge, Prior, optimize
 from .pyramid import ReducedFrame, SurfelPyramid, build_pyramid, reduce_frame
 from .registration import Registration, Target
 from .static_part import MOST_MOVING, SOME_MOVING, register_static, without_left_out
@@ -32,6 +32,8 @@ FEW_MOVING, LEAST_AGREEMENT = 0.03, 0.5
 # [m, rad] farther from where the camera was expected, little may contradict
 JUMP = 0.1, np.radians(7)
 FRAME_CORRECTION = 0.3, np.radians(20)  # [m, rad] a result farther from its guess is wrong
+NOT_MET = "in a second map, begun where the camera was lost, which has not met the first yet"
+NEVER_MET = "in a second map, begun where the camera was lost, which never surely met the first"
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +104,9 @@ class KeyframeOdometry:
         """
         poses, newest = self.keyframes.T_world_keyframe, self.reference
         T_newest_world = se3.inverse(poses[newest])
+        recent = self.keyframes.same_island(newest, range(max(0, newest - window + 1), newest + 1))
         targets = [
-            Target(self.keyframes.pyramid(k), se3.inverse(poses[k]) @ poses[newest])
-            for k in range(max(0, newest - window + 1), newest + 1)
+            Target(self.keyframes.pyramid(k), se3.inverse(poses[k]) @ poses[newest]) for k in recent
         ]
         guess = T_newest_world @ T_world_camera
         found, compared = register_static(
@@ -126,15 +128,22 @@ class KeyframeOdometry:
         return found, problem
 
     def add_keyframe(
-        self, prepared: PreparedFrame, T_world_camera: NDArray, registration: Registration | None
+        self,
+        prepared: PreparedFrame,
+        T_world_camera: NDArray,
+        registration: Registration | None,
+        island: int | None = None,
     ) -> int:
         """Make the frame a keyframe and the new reference; `registration` is its alignment to the
-        reference before it. Returns its number.
+        reference before it, whose sub-map it belongs to unless another `island` is given. Returns its
+        number.
         """
         reduced = without_left_out(prepared.reduced, prepared.pyramid)
         keyframe = Keyframe(prepared.frame.index, reduced, prepared.features)
         before = self.reference
-        number = self.keyframes.add(keyframe, prepared.pyramid, T_world_camera)
+        if island is None:
+            island = self.island
+        number = self.keyframes.add(keyframe, prepared.pyramid, T_world_camera, island)
         if registration is not None:
             self.edges.append(Edge.of(before, number, registration))
             # from now on the frame is its own keyframe: identity pose
@@ -144,6 +153,24 @@ class KeyframeOdometry:
                 )
         self.reference = number
         return number
+
+    @property
+    def island(self) -> int:
+        """The sub-map that frames are aligned to; 0: the first."""
+        return self.keyframes.islands[self.reference] if len(self.keyframes) else 0
+
+    def join(self, island: int, other: int, T_other_island: NDArray, edges: Sequence[Edge]) -> None:
+        """Let a sub-map become a part of another one, in whose world it lies as the transform says,
+        held there by edges.
+        """
+        poses, islands = self.keyframes.T_world_keyframe, self.keyframes.islands
+        for number, each in enumerate(islands):
+            if each == island:
+                poses[number] = se3.normalized(T_other_island @ poses[number])
+                islands[number] = other
+        self.edges += edges
+        self.version += 1  # also where nothing is left to optimise
+        self.optimize()
 
     def link_keyframe(self, number: int, by_appearance: bool) -> None:
         """Add edges from a new keyframe to recent ones, and to older ones that close a loop."""
@@ -160,10 +187,20 @@ class KeyframeOdometry:
     def optimize(self) -> None:
         """Move the keyframes to the poses that fit all edges and priors best."""
         if self.edges:
-            graph = optimize(self.keyframes.T_world_keyframe, self.edges, self.priors)
+            graph = optimize(
+                self.keyframes.T_world_keyframe, self.edges, [*self.priors, *self._anchors()]
+            )
             self.keyframes.T_world_keyframe = list(graph.T_world_node)
             self.optimizations += 1
             self.version += 1
+
+    def _anchors(self) -> list[Prior]:
+        """What holds each of several sub-maps, which no edge does."""
+        islands, poses = self.keyframes.islands, self.keyframes.T_world_keyframe
+        first = {island: islands.index(island) for island in islands}
+        if len(first) < 2:
+            return []
+        return [Prior(number, poses[number], ANCHOR * np.eye(6)) for number in first.values()]
 
     def is_far(self, registration: Registration) -> bool:
         """Whether a frame is so far from its keyframe that it becomes one itself."""
@@ -191,17 +228,24 @@ class KeyframeOdometry:
             if registration is None
             else {"fitness": registration.fitness, "rmse": registration.rmse}
         )
+        T = self.keyframes.T_world_keyframe[keyframe] @ T_keyframe_camera
         tracked = TrackedFrame(
             prepared.frame.index,
             verdict,
-            self.keyframes.T_world_keyframe[keyframe] @ T_keyframe_camera,
+            T,
             prepared.frame.timestamp,
             keyframe=self.keyframes.items[keyframe].index,
             message=message,
             **fit,
         )
         self.placements.append(Placement(tracked, keyframe, T_keyframe_camera, registration))
-        return tracked
+        return self.as_known(NOT_MET)
+
+    def as_known(self, apart: str = NOT_MET) -> TrackedFrame:
+        """The last frame where its keyframe says that it lies; why it has no pose where that is
+        `apart` from the first map.
+        """
+        return self._final(self.placements[-1], apart)
 
     def give_up(
         self, index: int, timestamp: float | None, verdict: Verdict, message: str
@@ -219,7 +263,7 @@ class KeyframeOdometry:
             self.version,
             np.array([keyframe.index for keyframe in self.keyframes.items], np.int64),
             np.array(self.keyframes.T_world_keyframe, np.float64).reshape(-1, 4, 4),
-            np.ones(len(self.keyframes), bool),
+            np.array(self.keyframes.islands, np.int64) == 0,
             np.array([placement.tracked.index for placement in placements], np.int64),
             np.array([-1 if p.keyframe is None else p.keyframe for p in placements], np.int64),
             np.array([np.eye(4) if T is None else T for T in poses]).reshape(-1, 4, 4),
@@ -230,22 +274,35 @@ class KeyframeOdometry:
         self.optimize()
         frames = []
         for placement in self.placements:
-            pose = None
-            if placement.keyframe is not None and placement.T_keyframe_camera is not None:
-                pose = se3.normalized(
-                    self.keyframes.T_world_keyframe[placement.keyframe]
-                    @ placement.T_keyframe_camera
-                )
-            frames.append(replace(placement.tracked, T_world_camera=pose))
+            frames.append(self._final(placement, NEVER_MET))
         indices = [keyframe.index for keyframe in self.keyframes.items]
         loops = tuple((indices[edge.a], indices[edge.b]) for edge in self.edges if edge.loop)
+        apart = len({*self.keyframes.islands} - {0})
         counts = {
             "keyframes": len(indices),
             "edges": len(self.edges),
             "loops": len(loops),
             "optimizations": self.optimizations,
+            **({"islands": apart} if apart else {}),
         }
         return TrackingResult(tuple(frames), tuple(indices), loops, {**counts, **(details or {})})
+
+    def _final(self, placement: Placement, apart: str) -> TrackedFrame:
+        """A frame where its keyframe says that it lies, or why it lies `apart`."""
+        tracked, number = placement.tracked, placement.keyframe
+        if number is None or placement.T_keyframe_camera is None:
+            return replace(tracked, T_world_camera=None)
+        T = se3.normalized(self.keyframes.T_world_keyframe[number] @ placement.T_keyframe_camera)
+        if self.keyframes.islands[number]:
+            return replace(
+                tracked,
+                verdict=Verdict.APART,
+                T_world_camera=None,
+                T_apart_camera=T,
+                keyframe=None,
+                message=apart,
+            )
+        return replace(tracked, T_world_camera=T, T_apart_camera=None)
 
 
 def problem_of(found: Registration, guess: NDArray, agreement: float = FRAME_AGREEMENT) -> str:

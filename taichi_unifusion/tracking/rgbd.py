@@ -2,7 +2,8 @@
 
 Every frame is aligned to the last keyframe, starting from a constant-motion guess; keyframes are
 aligned to all others that see the same surface, loops included, and a pose graph distributes the
-drift. A frame that fits nowhere gets no pose; the next ones are relocalised by their features.
+drift. A frame that fits nowhere gets no pose; the next ones are relocalised by their features, or
+begin a second map, which joins the first at the first sure overlap.
 """
 
 from __future__ import annotations
@@ -27,8 +28,16 @@ from .base import (
 )
 from .features import locate, most_similar
 from .fixed_part import FixedPart, without
+from .islands import Islands
 from .loop_closure import believable
-from .odometry import FRAME_AGREEMENT, SURE_AGREEMENT, KeyframeOdometry, Placement, PreparedFrame
+from .odometry import (
+    FRAME_AGREEMENT,
+    SURE_AGREEMENT,
+    KeyframeOdometry,
+    Placement,
+    PreparedFrame,
+    problem_of,
+)
 from .registration import Registration, register
 
 REACH, FASTEST = 0.3, 0.15  # [m], [m a frame] a camera is not faster than
@@ -38,6 +47,9 @@ FIXED = (
     "tracking; leave it out of the map with --preprocess.depth-min, or without those readings in the recording"
 )
 CANDIDATES = 3  # keyframes that a lost frame is compared with
+LOST_FOR = 3  # frames, after which those that fit each other begin a second map
+APART_KEYFRAMES = 10  # frames of it from one keyframe to the next at most
+LEAST_SIGHTINGS = 2  # keyframes of it that must say the same before it joins another
 # The world of a recording without poses: origin at the first camera, z up if that camera is level.
 T_WORLD_FIRST = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -77,12 +89,18 @@ class RgbdTracker(Tracker):
         self.known_motion = False  # whether `motion` was observed
         self.before: PreparedFrame | None = None  # the last frame, where it was tracked
         self.missed = 0  # frames since then
+        self.islands = Islands(self.odometry, self.settings.photometric_weight)
+        self.frames = 0  # that were tracked or tried
+        # by sub-map: the last frame there was this one, and lay there
+        self.seen: dict[int, tuple[int, NDArray[np.float64]]] = {}
+        self.candidate: PreparedFrame | None = None  # a lost frame that may begin a second map
 
     def track(self, frame: Frame) -> TrackedFrame:
         if self.fixed.looking and self.fixed.look(frame):
             return self._begin_again()
         if self.fixed.mask is not None:
             frame = replace(frame, depth=without(frame, self.fixed.mask))
+        self.frames += 1
         tracked = self._track(frame)
         self.missed = self.missed + 1 if self.lost else 0
         return tracked
@@ -119,6 +137,10 @@ class RgbdTracker(Tracker):
             return self._accept(prepared, found, Verdict.RELOCALISED)
         if sum(placement.keyframe is not None for placement in odometry.placements) == 1:
             return self._restart(prepared)
+        if (found := self._fits_candidate(prepared)) is not None:
+            self._begin_island()
+            return self._accept(prepared, found, Verdict.TRACKED)
+        self.candidate = prepared
         return self._give_up(frame, problem)
 
     def skip(self, index: int, error: Exception) -> TrackedFrame:
@@ -138,6 +160,7 @@ class RgbdTracker(Tracker):
     def _start(self, prepared: PreparedFrame) -> TrackedFrame:
         self.odometry.add_keyframe(prepared, self.T_world_first, None)
         self.T_world_camera = self.T_world_first
+        self.seen[0] = self.frames, self.T_world_first
         return self.odometry.place(prepared, Verdict.TRACKED, np.eye(4))
 
     def _restart(self, prepared: PreparedFrame) -> TrackedFrame:
@@ -217,17 +240,69 @@ class RgbdTracker(Tracker):
                 prepared.pyramid, keyframes.pyramid(number), guess, self.settings.photometric_weight
             )
             T_world_camera = keyframes.T_world_keyframe[number] @ found.T_target_source
-            distance, _ = se3.distance(self.T_world_camera, T_world_camera)
-            if believable(found, guess) and distance < self._reach:
+            if believable(found, guess) and self._reachable(
+                keyframes.islands[number], T_world_camera
+            ):
                 return number, found
         return None
 
-    @property
-    def _reach(self) -> float:
-        """How far the camera may have come [m] since it was last seen: a place that repeats looks
-        like this one, too.
+    def _reachable(self, island: int, T_world_camera: NDArray) -> bool:
+        """Whether the camera may have come there since it was last seen in a sub-map: a place that
+        repeats looks like this one, too.
         """
-        return REACH + FASTEST * (self.missed + 1)
+        if island not in self.seen:
+            return True
+        frame, T = self.seen[island]
+        distance, _ = se3.distance(T, T_world_camera)
+        return bool(distance < REACH + FASTEST * (self.frames - frame))
+
+    def _fits_candidate(self, prepared: PreparedFrame) -> Registration | None:
+        """The alignment of a lost frame to the lost frame before, from where on both are a map."""
+        before, placements = self.candidate, self.odometry.placements
+        if before is None or placements[-1].tracked.index != before.frame.index:
+            return None
+        if self.missed < LOST_FOR or not self.settings.loops:
+            return None
+        guess = np.eye(4)
+        found = register(prepared.pyramid, before.pyramid, guess, self.settings.photometric_weight)
+        return None if problem_of(found, guess, SURE_AGREEMENT) else found
+
+    def _begin_island(self) -> None:
+        """Begin a second map with the lost frame before, about where the camera was lost."""
+        first, odometry = self.candidate, self.odometry
+        assert first is not None
+        lost = odometry.placements.pop()
+        number = odometry.add_keyframe(first, self.T_world_camera, None, self.islands.begin())
+        known = replace(
+            lost.tracked,
+            verdict=Verdict.TRACKED,
+            T_world_camera=self.T_world_camera,
+            keyframe=first.frame.index,
+            message="",
+        )
+        odometry.placements.append(Placement(known, number, np.eye(4)))
+        self.candidate = None
+        logger.info("frame %d: lost; a second map begins here", first.frame.index)
+
+    def _meet(self, number: int) -> None:
+        """Look for what a keyframe of a second map shows of other maps, and let it join when that is
+        sure; leave it where the camera proves to be in another one.
+        """
+        odometry = self.odometry
+        sighting = self.islands.look(number, self._reachable)
+        if sighting is None:
+            return
+        agreeing = self.islands.agreeing(sighting)
+        if self.islands.contradicted(sighting):  # what it was begun on has moved
+            odometry.reference = sighting.edge.a
+            T = odometry.keyframes.T_world_keyframe[number]
+            self.T_world_camera = se3.normalized(sighting.T_other_island @ T)
+        elif len(agreeing) >= LEAST_SIGHTINGS:
+            self.islands.join(agreeing)
+            logger.info(
+                "frame %d: the second map has met the first", odometry.keyframes.items[number].index
+            )
+            self.T_world_camera = odometry.keyframes.T_world_keyframe[number]
 
     def _accept(
         self, prepared: PreparedFrame, found: Registration, verdict: Verdict
@@ -239,13 +314,22 @@ class RgbdTracker(Tracker):
         self.known_motion, self.before = not self.lost, prepared
         self.motion = np.eye(4) if self.lost else se3.inverse(self.T_world_camera) @ T_world_camera
         self.lost = False
-        tracked = odometry.place(prepared, verdict, found.T_target_source, found)
-        if odometry.is_far(found):
+        odometry.place(prepared, verdict, found.T_target_source, found)
+        self.T_world_camera = T_world_camera
+        if odometry.is_far(found) or self._is_stale(prepared):
             number = odometry.add_keyframe(prepared, T_world_camera, found)
             odometry.link_keyframe(number, by_appearance=True)
-            T_world_camera = odometry.keyframes.T_world_keyframe[number]
-        self.T_world_camera = T_world_camera
-        return replace(tracked, T_world_camera=T_world_camera)
+            self.T_world_camera = odometry.keyframes.T_world_keyframe[number]
+            if odometry.island:
+                self._meet(number)
+        self.seen[odometry.island] = self.frames, self.T_world_camera
+        return odometry.as_known()
+
+    def _is_stale(self, prepared: PreparedFrame) -> bool:
+        """Whether a second map needs a keyframe, so that it is looked for in others."""
+        odometry = self.odometry
+        last = odometry.keyframes.items[odometry.reference].index
+        return bool(odometry.island) and prepared.frame.index - last >= APART_KEYFRAMES
 
     def _give_up(self, frame: Frame, problem: str) -> TrackedFrame:
         self.lost, self.motion, self.known_motion = True, np.eye(4), False

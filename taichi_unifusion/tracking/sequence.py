@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 COLUMNS = ("frame", "timestamp", "verdict", "fitness", "rmse_m", "keyframe", "message")
-NO_POSE = (Verdict.LOST, Verdict.MISSING, Verdict.UNREADABLE)
+NO_POSE = (Verdict.LOST, Verdict.APART, Verdict.MISSING, Verdict.UNREADABLE)
 
 
 def track_sequence(
