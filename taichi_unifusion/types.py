@@ -77,6 +77,8 @@ class Frame:
     # property images, (H, W, c)
     images: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     features: Mapping[str, ImageView] = field(default_factory=dict)  # of any size, (h, w, c)
+    # its pose lies in a world of its own: it is kept, and fused once its place in the map is known
+    apart: bool = False
 
     def __post_init__(self) -> None:
         at = self.label

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..config import Config
 from ..datasets import Dataset
+from ..errors import PoseError
+from ..run_log import SKIP_REASONS, SkippedFrame
 from ..types import Trajectory
 from .color_camera import AUTO
 from .into import Addition, remembered
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
+NO_PLACE = SKIP_REASONS[PoseError]  # of frames that are apart in the end
 
 
 @dataclass(frozen=True)
@@ -150,10 +153,10 @@ def map_in_one_pass(
             on_skip=watcher.on_skip,
         )
     result = concluded(tracker, time.perf_counter() - started, warnings, run.interrupted)
-    run = settle(pipeline, run, tracker.current_poses())
     run = replace(
         run, skipped=tuple(replace(each, index=frames.place_of(each.index)) for each in run.skipped)
     )
+    run = settle(pipeline, run, tracker.current_poses())
     write_tracking(folder.tracking, result)
     write_trajectory(folder.tracked_poses, result.trajectory)
     assert pipeline.follower is not None
@@ -215,9 +218,20 @@ def settle(pipeline: Pipeline, run: RunResult, poses: CurrentPoses) -> RunResult
             followed.moves,
             followed.seconds,
         )
-    before = run.trajectory
-    T = [final.get(step.index, T) for step, T in zip(run.steps, before.T_world_camera, strict=True)]
-    return replace(run, trajectory=Trajectory(before.timestamps, _stacked(T)))
+    used = [i for i, step in enumerate(run.steps) if step.index in final]
+    lost = [
+        SkippedFrame(step.index, NO_PLACE, "its place in the map was never sure")
+        for step in run.steps
+        if step.index not in final
+    ]
+    skipped = sorted((*run.skipped, *lost), key=lambda each: each.index)
+    T = [final[run.steps[i].index] for i in used]
+    return replace(
+        run,
+        steps=tuple(run.steps[i] for i in used),
+        skipped=tuple(skipped),
+        trajectory=Trajectory(run.trajectory.timestamps[used], _stacked(T)),
+    )
 
 
 def _stacked(T: list) -> Any:

@@ -119,7 +119,8 @@ class MapFollower:
         for number in self._waiting():
             self._move(number, self._wanted.pop(number))
         self._compact()
-        if not self._settled:
+        # maps of features have what lies nowhere, too: they take every frame at once
+        if not self._settled or any(kept.place is None for kept in self.store.windows):
             self.settle()
         return self.summary()
 

@@ -115,6 +115,7 @@ class KeptWindow:
     cells: Mapping[tuple[str, ...], KeptCells]  # by the names of the maps of a part
     views: KeptViews
     features: Sequence[KeptFeatures] = field(default=())
+    apart: bool = False  # fused nowhere: the place of its world in the map is not known yet
 
     @property
     def nbytes(self) -> int:

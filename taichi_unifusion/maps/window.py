@@ -89,6 +89,7 @@ class Window:
     images: DeviceArray  # (K, H, W) [m] depth of the views
     parts: dict[tuple[str, ...], OpenPart]  # by the names of their maps
     others: bool  # whether other maps want patches too
+    apart: bool = False  # it is kept, and not fused: nobody knows where it belongs yet
     T_camera_world: list[NDArray[np.float64]] = field(default_factory=list)  # of the views
     lenses: list[NDArray[np.float64]] = field(default_factory=list)  # as `lens_beside` has them
     frames: list[int] = field(default_factory=list)  # their places in the recording
@@ -204,7 +205,12 @@ class Window:
         """
         kept = {} if keep is None else self.parts
         cells = {names: each.kept_cells() for names, each in kept.items()}
-        pieces = [piece for each in self.parts.values() for piece in self._pieces(each)]
+        if self.apart:  # the sums are free
+            for each in self.parts.values():
+                each.part.binner.close(each.cells, each.arena)
+        pieces = [
+            piece for each in self.parts.values() if not self.apart for piece in self._pieces(each)
+        ]
         if keep is not None:
             pieces.append(Piece("keep", lambda: keep(self._kept(cells))))
         return pieces
@@ -219,7 +225,7 @@ class Window:
         T_keyframe_camera = inverse(np.array(self.T_camera_world) @ self.T_world_keyframe)
         views = KeptViews.of(self.images, self.camera, T_keyframe_camera, np.array(self.lenses))
         frames, features = tuple(self.frames), tuple(self.features)
-        return KeptWindow(frames, self.T_world_keyframe, cells, views, features)
+        return KeptWindow(frames, self.T_world_keyframe, cells, views, features, self.apart)
 
     def _poses(self) -> NDArray[np.float32]:
         """(K, 3, 4) T_camera_world of the views, as the keyframe's camera would have to see them."""
@@ -308,6 +314,7 @@ class WindowFusion:
             self._images[0],
             {part.names: self._open(part, frame) for part in parts},
             others,
+            frame.apart,
         )
         patches, touched = window.add(frame, find, reach)
         if patches.total == 0:
@@ -399,7 +406,8 @@ class WindowFusion:
     def _continues(self, window: Window, frame: Frame) -> bool:
         index, stride = self.borders
         gap = stride and abs(frame.index - index) > GAP * stride
-        same = frame.carried == window.carried and window.has_room_for(frame)
+        same = frame.carried == window.carried and frame.apart == window.apart
+        same = same and window.has_room_for(frame)
         return not gap and same and window.is_near(frame)
 
     def _open(self, part: Part, frame: Frame) -> OpenPart:

@@ -66,7 +66,7 @@ class WindowStore:
         return len(self.windows)
 
     def __call__(self, window: KeptWindow) -> None:
-        """Keep a window that was fused where it lies."""
+        """Keep a window that was fused where it lies, or nowhere if it is apart."""
         if self.first:
             window = replace(window, frames=tuple(self.first + i for i in window.frames))
         values, arrays = to_record(window)
@@ -75,7 +75,7 @@ class WindowStore:
                 window.frames,
                 window.T_world_keyframe,
                 window.views.T_keyframe_camera,
-                window.T_world_keyframe,
+                None if window.apart else window.T_world_keyframe,
                 self._packer.submit(pack, values, arrays),
             )
         )
@@ -159,7 +159,8 @@ class WindowStore:
                 frames = tuple(int(n) for n in values["frames"])
                 views = np.array(values["T_keyframe_camera"], np.float64).reshape(-1, 4, 4)
                 size = record.size
-                self.windows.append(Kept(frames, T, views, T, None, record, size))
+                place = None if values.get("apart") else T
+                self.windows.append(Kept(frames, T, views, place, None, record, size))
             elif values["kind"] == POSES:
                 for number, T in values["places"].items():
                     self.windows[int(number)].place = None if T is None else _pose(T)
@@ -197,6 +198,7 @@ def to_record(window: KeptWindow) -> tuple[dict[str, Any], dict[str, NDArray]]:
         "lenses": window.views.lenses.tolist(),
         "parts": parts,
         "features": features,
+        "apart": window.apart,
     }
     return values, arrays
 
@@ -227,7 +229,7 @@ def from_record(values: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> Kep
         for i, each in enumerate(values["features"])
     ]
     frames, T = tuple(values["frames"]), _pose(values["T_world_keyframe"])
-    return KeptWindow(frames, T, cells, views, features)
+    return KeptWindow(frames, T, cells, views, features, bool(values.get("apart")))
 
 
 def _camera_values(camera: PinholeCamera) -> list[float]:

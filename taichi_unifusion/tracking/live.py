@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..datasets.live import Arriving
-from ..errors import FrameError, PoseError
+from ..errors import FrameError
 from ..types import Frame, PinholeCamera
 from .base import CurrentPoses, Tracker
+from .online import as_tracked
 
 
 def warm_up(tracker: Tracker) -> None:
@@ -24,8 +25,8 @@ def warm_up(tracker: Tracker) -> None:
 
 
 class TrackedFrames(Arriving):
-    """Frames as they arrive, with the pose that a tracker finds for each; one without raises PoseError
-    that says why.
+    """Frames as they arrive, with the pose that a tracker finds for each, maybe apart from the world;
+    one without any raises PoseError that says why.
 
     Poses are those known at the time; `on_moved` is told where all frames are whenever a loop has
     moved earlier ones.
@@ -60,6 +61,4 @@ class TrackedFrames(Arriving):
         if self.tracker.version != self._version:
             self._version = self.tracker.version
             self.on_moved(self.tracker.current_poses())
-        if tracked.T_world_camera is None:
-            raise PoseError(f"{frame.label}: {tracked.verdict}, {tracked.message}")
-        return replace(frame, T_world_camera=tracked.T_world_camera)
+        return as_tracked(frame, tracked)

@@ -292,7 +292,8 @@ class KeyframeOdometry:
         tracked, number = placement.tracked, placement.keyframe
         if number is None or placement.T_keyframe_camera is None:
             return replace(tracked, T_world_camera=None)
-        T = se3.normalized(self.keyframes.T_world_keyframe[number] @ placement.T_keyframe_camera)
+        pose = self.keyframes.T_world_keyframe[number] @ placement.T_keyframe_camera
+        T: NDArray[np.float64] = se3.normalized(pose)
         if self.keyframes.islands[number]:
             return replace(
                 tracked,

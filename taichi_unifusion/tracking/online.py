@@ -12,12 +12,24 @@ from ..datasets.live import Arriving
 from ..datasets.loading import index_in_recording, load_ahead, recording_of
 from ..errors import FrameError, PoseError
 from ..types import Frame
-from .base import CurrentPoses, Tracker
+from .base import CurrentPoses, TrackedFrame, Tracker
+
+
+def as_tracked(frame: Frame, tracked: TrackedFrame) -> Frame:
+    """The frame with the pose that was found, maybe apart from the world; raises PoseError where there
+    is none.
+    """
+    if tracked.T_world_camera is not None:
+        return replace(frame, T_world_camera=tracked.T_world_camera)
+    if tracked.T_apart_camera is not None:
+        return replace(frame, T_world_camera=tracked.T_apart_camera, apart=True)
+    raise PoseError(f"{frame.label}: {tracked.verdict}, {tracked.message}")
 
 
 class OnlineFrames(Arriving):
     """Every `every`-th frame of a recording with the pose that the tracker, which sees all of them,
-    knows when its turn comes; a frame without one raises PoseError that says why.
+    knows when its turn comes, or with one apart from the world; a frame without any raises PoseError
+    that says why.
 
     `on_moved` is told where all frames are whenever earlier ones have moved, before the frame at
     which that was found is handed out.
@@ -61,6 +73,4 @@ class OnlineFrames(Arriving):
         if self.tracker.version != self._version:
             self._version = self.tracker.version
             self.on_moved(self.tracker.current_poses())
-        if tracked.T_world_camera is None:
-            raise PoseError(f"{frame.label}: {tracked.verdict}, {tracked.message}")
-        return replace(frame, T_world_camera=tracked.T_world_camera)
+        return as_tracked(frame, tracked)

@@ -8,10 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from walk import bare, black, errors, verdicts
+from places import DEVICE
+from scipy.spatial import cKDTree
+from walk import Listed, bare, black, errors, verdicts
 
+from taichi_unifusion.cli.following import following, settle
+from taichi_unifusion.config import Config
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
+from taichi_unifusion.maps.window_store import WindowStore
+from taichi_unifusion.pipeline import Pipeline
 from taichi_unifusion.tracking import Verdict
+from taichi_unifusion.tracking.online import OnlineFrames
 from taichi_unifusion.tracking.rgbd import RgbdTracker
 
 NEAR = 0.01  # [m] 4 mm are usual
@@ -25,6 +32,13 @@ def blackout(*parts: range) -> list:
     for part in parts:
         frames += [black(room[0])] * DARK * bool(frames) + [room[i] for i in part]
     return [replace(frame, index=i) for i, frame in enumerate(frames)]
+
+
+class Walk(Listed):
+    """Frames in memory, which have no poses if these are not wanted."""
+
+    def without_poses(self):
+        return Listed([bare(frame) for frame in self.items])
 
 
 def tracked(frames):
@@ -49,6 +63,25 @@ def test_what_was_seen_after_the_camera_was_lost_joins(meets):
     assert all(result.frames[i].verdict is Verdict.TRACKED for i in apart)
     assert verdicts(result)[8 + DARK :].count("tracked") >= 24
     assert tracker.current_poses().joined.all()
+
+
+def test_the_map_of_one_pass_holds_what_was_apart(meets):
+    """Windows of the second map are kept, and fused when it joins."""
+    frames, _, _ = meets
+    config = Config(device=DEVICE, voxel_size=0.1, window=4)
+    pipeline = Pipeline(config, keep=WindowStore())
+    tracker = RgbdTracker(T_world_first=frames[0].T_world_camera)
+    run = pipeline.run(OnlineFrames(Walk(frames), tracker, on_moved=following(pipeline)))
+    tracker.finish()
+    run = settle(pipeline, run, tracker.current_poses())
+    assert all(kept.place is not None for kept in pipeline.follower.store.windows)
+    used = {step.index for step in run.steps}
+    assert len(used) + len(run.skipped) == len(frames) and len(used) >= 8 + 24
+    direct = Pipeline(config)
+    direct.run([frames[i] for i in sorted(used)])
+    ours, theirs = (cKDTree(each.extract_mesh().vertices) for each in (pipeline, direct))
+    for a, b in ((ours, theirs), (theirs, ours)):
+        assert np.mean(a.query(b.data)[0] < 0.02) > 0.97
 
 
 def test_poses_of_the_second_map_are_guesses_of_its_own_world(meets):
