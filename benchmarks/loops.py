@@ -4,6 +4,7 @@ the true poses.
 
     python benchmarks/loops.py --data ../shared/data --paths living --drifts 0.05
     python benchmarks/loops.py --cycles 1000            no data: a window goes and comes back so often
+    python benchmarks/loops.py --cost 7scenes redkitchen --end 150    what following adds to mapping a video
     python benchmarks/loops.py --kept synthetic kitchen     what keeping and moving does to a map; bytes
 
 Prints tables. Needs the extra open3d for the rate of double surfaces.
@@ -100,16 +101,16 @@ def follow(run: Run, frames: Sequence[Frame], corrected: NDArray[np.float64]) ->
     assert follower is not None and isinstance(store, WindowStore)
     follower.follow({frame.index: T for frame, T in zip(frames, corrected, strict=True)})
     started = time.process_time()
-    follower.work(np.inf)
-    moved = time.process_time()
-    follower.settle()
-    settled = time.process_time() - moved
-    done, spent = follower.summary(), time.process_time() - started
-    moving = (moved - started) / max(done.moves, 1)
+    done = follower.finish(alone=True)
+    spent = time.process_time() - started
+    follower.settle()  # once more, for its time
+    settled = time.process_time() - started - spent
+    moving = (spent - settled) / max(done.moves + done.anew, 1)
     window = run.seconds / max(len(store), 1)
     details = {
         "windows": len(store),
         "moved": done.moved,
+        "anew": done.anew,
         "ms_a_move": 1e3 * moving,
         "ms_a_window": 1e3 * window,
         "move_to_window": moving / window,
@@ -190,6 +191,19 @@ def compare(scene: Scene, drift: float) -> dict[str, dict[str, float | None]]:
     add("from scratch", fuse(at_poses(frames, poses.corrected), None), poses.corrected)
     add("true poses", fuse(frames, None), poses.true)
     return rows
+
+
+def cost(format: str, path: str, data: Path, end: int, drift: float) -> None:
+    """What following adds to the time of mapping every frame of a video whose loop moves all of it."""
+    recording = uf.open_dataset(format, data / path)[:end]
+    frames = [recording[i] for i in range(len(recording))]
+    poses = with_drift(np.array([frame.require_pose() for frame in frames]), drift)
+    fuse(frames[:25], WindowStore())  # compiles
+    without = fuse(at_poses(frames, poses.drifted), None)
+    run = fuse(at_poses(frames, poses.drifted), WindowStore())
+    details = follow(run, frames, poses.corrected).details
+    details |= {"keeping_to_without": run.seconds / without.seconds, "frames": len(frames)}
+    print(" | ".join(f"{key} {value:.3g}" for key, value in details.items()), flush=True)
 
 
 def kept(scene: Scene) -> None:
@@ -287,6 +301,10 @@ def main() -> int:
     parser.add_argument("--drifts", nargs="+", type=float, default=[0.02, 0.05, 0.10])
     parser.add_argument("--frames", type=int, help="about how many frames (default: every 5th)")
     parser.add_argument("--cycles", type=int, help="only move one window so often")
+    parser.add_argument(
+        "--cost", nargs=2, metavar=("FORMAT", "PATH"), help="only the time it takes"
+    )
+    parser.add_argument("--end", type=int, default=150, help="frames of --cost")
     parser.add_argument("--kept", nargs="+", choices=list(SCENES), metavar="SCENE")
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--threads", type=int, help="CPU threads of Taichi (default: all)")
@@ -295,6 +313,9 @@ def main() -> int:
     uf.init(threads=options.threads)
     if options.cycles:
         cycle(options.cycles)
+        return 0
+    if options.cost:
+        cost(*options.cost, options.data, options.end, options.drifts[0])
         return 0
     if options.kept:
         for name in options.kept:

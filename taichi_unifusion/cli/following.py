@@ -125,9 +125,11 @@ def map_in_one_pass(
     stop: Callable[[], bool],
     encoder: ImageEncoder | None,
     watcher: Watcher,
+    *,
+    watched: bool,
 ) -> Mapped:
-    """Track and fuse frames as they come, let the map follow, and end with all of it at the final
-    poses.
+    """Track and fuse frames as they come, let the map follow, while it is `watched` or in the end, and
+    end with all of it at the final poses.
     """
     from .. import runtime
     from ..files.trajectories import write_trajectory
@@ -140,6 +142,8 @@ def map_in_one_pass(
     tracker = _tracker(options)
     store = open_store(folder, options.output, settings, moves=True)
     pipeline = Pipeline(settings, encoder=encoder, keep=store)
+    if pipeline.follower is not None and not watched:  # nobody sees the map before its end
+        pipeline.follower.budget = 0.0
     frames = OnlineFrames(recording, tracker, options.recording.every, following(pipeline))
     logger.info("tracking: %s, in one pass with mapping", poses.tracking)
     warnings = say_warnings(frames.frames, tracker)
@@ -207,15 +211,16 @@ def settle(pipeline: Pipeline, run: RunResult, poses: CurrentPoses) -> RunResult
         return run
     final = poses.by_frame
     pipeline.follower.follow(final)
-    followed = pipeline.follower.finish()
-    if followed.moves:
+    followed = pipeline.follower.finish(alone=True)
+    if followed.moves or followed.anew:
         logger.info(
             "the map followed: %d of %d windows lie elsewhere than they were fused at first, up to %.1f cm; "
-            "%d moves, %.1f s",
+            "%d moves, %d fused anew, %.1f s",
             followed.moved,
             followed.windows,
             100 * followed.farthest,
             followed.moves,
+            followed.anew,
             followed.seconds,
         )
     used = [i for i, step in enumerate(run.steps) if step.index in final]

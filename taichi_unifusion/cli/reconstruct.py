@@ -228,7 +228,10 @@ def _mapped(
     every, wanted = options.recording.every, options.recording
     if not options.cluster.wanted and in_one_pass(recording, options):
         recording, color = found_color(recording, color)
-        mapped = map_in_one_pass(recording, options, folder, stop, encoder, watcher)
+        watched = options.watch.view or options.watch.view_window
+        mapped = map_in_one_pass(
+            recording, options, folder, stop, encoder, watcher, watched=watched
+        )
         frames = recording[::every]
         return mapped, frames, source_of(wanted, len(frames), color)
     tracking, tracked, written, added = None, None, (), None

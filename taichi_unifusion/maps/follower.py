@@ -25,10 +25,13 @@ from .property_group import MapGroup
 from .surface_map import SurfaceMap
 from .value_scale import steps_for
 from .window import WindowFusion
-from .window_store import WindowStore
+from .window_store import Kept, WindowStore
 
 LEAST_MOVE, LEAST_TURN = 0.005, 0.25  # [m, degrees] a window that moved by less stays
 BUDGET = 15.0  # [ms] a frame, in the mean, for windows that move while frames come in
+ANEW = (
+    0.5  # share of the windows that wait to move, from which on it is quicker to fuse all of them
+)
 Pose = NDArray[np.float64]
 
 
@@ -39,6 +42,7 @@ class Followed:
     windows: int = 0  # that were kept
     moved: int = 0  # of them, those that do not lie where they were fused first
     moves: int = 0  # how often a window was taken out, put back, or both
+    anew: int = 0  # windows that were fused anew in the end, since most had moved
     farthest: float = 0.0  # [m] that a window lies from where it was fused first
     seconds: float = 0.0
     settled: float = 0.0  # [s] of them, for votes and features in the end
@@ -98,6 +102,8 @@ class MapFollower:
         """
         if milliseconds is not None:
             self._credit, self._price = milliseconds, 0.0
+        if not self._credit:
+            return 0
         count, waiting = 0, self._waiting() if self._credit >= self._price else []
         for number in waiting:
             if self._credit < self._price:
@@ -113,11 +119,17 @@ class MapFollower:
             self._credit = 0.0
         return count
 
-    def finish(self) -> Followed:
-        """Move all windows that still lie elsewhere, then settle; returns what all of it took."""
+    def finish(self, *, alone: bool = False) -> Followed:
+        """Move all windows that still lie elsewhere, then settle; returns what all of it took. Where
+        maps hold these windows `alone`, they may be fused anew instead: the maps are then the same.
+        """
         self.fusing.fusion.flush()
-        for number in self._waiting():
-            self._move(number, self._wanted.pop(number))
+        waiting = self._waiting()
+        if alone and len(waiting) > ANEW * len(self.store):
+            self._fuse_anew()
+        else:
+            for number in waiting:
+                self._move(number, self._wanted.pop(number), vote=False)
         self._compact()
         # maps of features have what lies nowhere, too: they take every frame at once
         if not self._settled or any(kept.place is None for kept in self.store.windows):
@@ -213,18 +225,40 @@ class MapFollower:
         moved, turned = distance(place, target)
         return max(moved / LEAST_MOVE, np.degrees(turned) / LEAST_TURN)
 
-    def _move(self, number: int, target: Pose | None) -> None:
-        """Take a window out, and put it back elsewhere."""
+    def _fuse_anew(self) -> None:
+        """Empty the maps, and fuse every window where it belongs."""
+        started = time.perf_counter()
+        for each in self.fusing.maps.values():
+            each.grid.clear()
+        for number, kept in enumerate(self.store.windows):
+            target, window = self._wanted.pop(number, kept.place), self.store[number]
+            if target is not None:
+                target = self._at_home(kept, window, target)
+                self._fuse(window, target, 1)
+            self.store.place({number: target})
+        self._settled = False
+        spent = time.perf_counter() - started
+        self.done = replace(
+            self.done, anew=self.done.anew + len(self.store), seconds=self.done.seconds + spent
+        )
+
+    def _at_home(self, kept: Kept, window: KeptWindow, target: Pose) -> Pose:
+        """The pose itself, or where the window lay at first, to the bit, where that is the same."""
+        return kept.T_world_keyframe if window.motion(target) is None else target
+
+    def _move(self, number: int, target: Pose | None, *, vote: bool = True) -> None:
+        """Take a window out, and put it back elsewhere; without `vote`, rays vote in the end alone."""
         started = time.perf_counter()
         kept, window = self.store.windows[number], self.store[number]
-        if target is not None and window.motion(target) is None:
-            target = kept.T_world_keyframe  # where it lay at first, to the bit
+        surfaces = self.surfaces if vote else ()
+        if target is not None:
+            target = self._at_home(kept, window, target)
         if kept.place is not None:
-            _let_vote(self.surfaces, window, kept.place, -1)
+            _let_vote(surfaces, window, kept.place, -1)
             self._fuse(window, kept.place, -1)
         if target is not None:
             self._fuse(window, target, 1)
-            _let_vote(self.surfaces, window, target, 1)
+            _let_vote(surfaces, window, target, 1)
         self.store.place({number: target})
         self._settled = False
         spent = time.perf_counter() - started

@@ -223,20 +223,16 @@ class KeyframeOdometry:
         """Note where a frame lies relative to the reference keyframe."""
         keyframe = self.reference
         T_keyframe_camera = se3.normalized(T_keyframe_camera)
-        fit = (
-            {}
-            if registration is None
-            else {"fitness": registration.fitness, "rmse": registration.rmse}
-        )
         T = self.keyframes.T_world_keyframe[keyframe] @ T_keyframe_camera
         tracked = TrackedFrame(
             prepared.frame.index,
             verdict,
             T,
             prepared.frame.timestamp,
+            None if registration is None else registration.fitness,
+            None if registration is None else registration.rmse,
             keyframe=self.keyframes.items[keyframe].index,
             message=message,
-            **fit,
         )
         self.placements.append(Placement(tracked, keyframe, T_keyframe_camera, registration))
         return self.as_known(NOT_MET)

@@ -102,6 +102,15 @@ def test_windows_that_moved_are_as_if_fused_there_in_the_first_place(frames, con
     assert contents(pipeline) != contents(kept_run(frames, config))
 
 
+@pytest.mark.parametrize("alone", [False, True])
+def test_in_the_end_windows_move_one_by_one_or_all_are_fused_anew(frames, alone):
+    pipeline = kept_run(frames)
+    pipeline.follower.move_to(moved(pipeline))
+    done = pipeline.follower.finish(alone=alone)
+    assert (done.moves, done.anew) == ((0, 3) if alone else (2, 0))
+    assert contents(pipeline) == contents(fused_at(pipeline, CONFIG))
+
+
 def test_a_false_loop_that_is_withdrawn_leaves_no_trace(frames):
     pipeline = kept_run(frames)
     pipeline.follower.settle()
