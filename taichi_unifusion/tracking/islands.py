@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..geometry import se3
 from .features import locate, most_similar
 from .loop_closure import believable
-from .odometry import SURE_AGREEMENT, KeyframeOdometry
+from .odometry import KeyframeOdometry
 from .pose_graph import Edge
 from .registration import register
 
@@ -62,8 +62,7 @@ class Islands:
                 keyframes.pyramid(number), keyframes.pyramid(other), guess, self.weight
             )
             T = keyframes.T_world_keyframe[other] @ found.T_target_source
-            sure = believable(found, guess) and found.agreement >= SURE_AGREEMENT
-            if sure and reachable(keyframes.islands[other], T):
+            if believable(found, guess) and reachable(keyframes.islands[other], T):
                 sighting = Sighting(
                     number,
                     island,

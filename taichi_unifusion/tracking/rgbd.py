@@ -265,7 +265,7 @@ class RgbdTracker(Tracker):
             return None
         guess = np.eye(4)
         found = register(prepared.pyramid, before.pyramid, guess, self.settings.photometric_weight)
-        return None if problem_of(found, guess, SURE_AGREEMENT) else found
+        return None if problem_of(found, guess) else found
 
     def _begin_island(self) -> None:
         """Begin a second map with the lost frame before, about where the camera was lost."""

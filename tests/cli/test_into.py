@@ -19,6 +19,7 @@ from taichi_unifusion.tracking.keyframe_file import read_keyframes
 
 ROOM = ["synthetic", "--option", "frames=120", "--option", "width=240", "--option", "height=180"]
 SMALL = ["--voxel-size", "0.1", "--window", "4", "--device", "cpu", "--color-camera", "none"]
+SMALL += ["--mesh.resolution", "2", "--mesh.formats", "ply"]
 OFF = 0.002, 0.1  # [m, degrees] of a camera that found its place; 0.3 mm and 0.01 degrees are usual
 APART = 0.002  # [m] between surfaces, in the mean
 
@@ -104,9 +105,9 @@ def test_two_results_become_one_in_the_world_of_the_first(
     assert record["recording"]["start"] == 0 and record["recording"]["before"][0]["start"] == 8
     assert len(WindowStore.open(out / "windows.log")) == 4 + 4
     assert main(["info", str(out)]) == 0
-    # what was merged is a map like others: a third recording joins it
-    words = ["--into", str(out), "--out", str(tmp_path / "three")]
-    assert reconstruct(*words, start=20, end=26) == 0
+    assert len(read_keyframes(out / "keyframes.log")) > len(
+        read_keyframes(monday / "keyframes.log")
+    )
 
 
 def test_worlds_that_are_not_the_same_are_not_added_up(monday, tuesday, tmp_path, capsys):
