@@ -38,6 +38,7 @@ from .odometry import (
     PreparedFrame,
     problem_of,
 )
+from .pyramid import build_pyramid
 from .registration import Registration, register
 
 REACH, FASTEST = 0.3, 0.15  # [m], [m a frame] a camera is not faster than
@@ -132,6 +133,8 @@ class RgbdTracker(Tracker):
             found, _ = self._align(prepared)
         if found is not None:
             return self._accept(prepared, found, Verdict.TRACKED)
+        # what contradicted the last keyframe was left out of it
+        prepared = replace(prepared, pyramid=build_pyramid(prepared.reduced))
         if (place := self._relocalise(prepared)) is not None:
             odometry.reference, found = place
             return self._accept(prepared, found, Verdict.RELOCALISED)
