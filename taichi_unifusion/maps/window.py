@@ -205,12 +205,7 @@ class Window:
         """
         kept = {} if keep is None else self.parts
         cells = {names: each.kept_cells() for names, each in kept.items()}
-        if self.apart:  # the sums are free
-            for each in self.parts.values():
-                each.part.binner.close(each.cells, each.arena)
-        pieces = [
-            piece for each in self.parts.values() if not self.apart for piece in self._pieces(each)
-        ]
+        pieces = [piece for each in self.parts.values() for piece in self._pieces(each)]
         if keep is not None:
             pieces.append(Piece("keep", lambda: keep(self._kept(cells))))
         return pieces
@@ -235,6 +230,8 @@ class Window:
         name, encoder = " + ".join(part.part.names), part.part.encoder
         binned = part.part.binner.close(part.cells, part.arena)
         part.cells.arrays.grow_ahead(part.cells.count)
+        if self.apart:  # the sums are free, and nothing is fused
+            return
         local = encoder.room(binned)
         step = PIECE // encoder.layout.size
         for begin in range(0, max(binned.count, 1), step):
