@@ -109,7 +109,7 @@ def _compacting(of: Arguments) -> tuple[float, float]:
 
 def _encoding(of: Arguments) -> tuple[float, float]:
     layout = of["layout"]
-    begin, end = of["begin"], of["end"]
+    begin, end = of["slots"]
     points = _rows(of["rows"], end)[begin:, 1]
     masks, neighbors = _rows(of["masks"], None), _rows(of["neighbors"], end)[begin:]
     seen = _cells(masks[neighbors] & _rows(of["window"], 27))  # (B, 27) cells
@@ -128,7 +128,7 @@ def _encoding(of: Arguments) -> tuple[float, float]:
 
 
 def _voting(of: Arguments) -> tuple[float, float]:
-    begin, end = of["begin"], of["end"]
+    begin, end = of["slots"]
     rank, K, poses = (
         of["rank"],
         np.array(of["K"]),

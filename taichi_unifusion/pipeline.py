@@ -331,8 +331,6 @@ class Pipeline:
         except Exception as error:  # noqa: BLE001
             failure = failure or self._ended_by(error)
             self.fusion.give_up()
-        if self._maps:
-            log.check_sides(self.surface.sides, self.surface.voxel_size)
         return log.result(interrupted, failure)
 
     def _ended_by(self, error: Exception) -> Exception:

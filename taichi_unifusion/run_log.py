@@ -28,14 +28,12 @@ from .errors import (
     check_kind,
 )
 from .maps import Integration
-from .maps.sides import Sides
 from .preprocessing import FARTHEST, PreprocessSettings
 from .types import Frame, Trajectory
 
 logger = logging.getLogger(__name__)
 
 MOST_OUTSIDE = 0.05  # of the readings may lie outside depth_min..depth_max unsaid
-MOST_OPPOSITE = 0.015  # of voxels seen again: a room has 0.1 to 0.4 %, one with a thin board 4 %
 SPARSE = 4  # one pixel of so many each way stands for all
 
 
@@ -225,15 +223,6 @@ class RunLog:
             if count > MOST_OUTSIDE / 2 * total
         ]
         self.warn("; ".join(shares))
-
-    def check_sides(self, sides: Sides, voxel_size: float) -> None:
-        """Warn where much of the surface is thinner than voxels can keep apart."""
-        if sides.opposite > MOST_OPPOSITE * sides.seen:
-            self.warn(
-                f"{sides.opposite / sides.seen:.0%} of the voxels seen again saw surface that faces the other way: "
-                f"boards or leaves too thin for voxels of {100 * voxel_size:g} cm, whose two sides mix; --detail fine "
-                f"or --voxel-size {0.4 * voxel_size:.2g} keeps them apart"
-            )
 
     def check_poses(self, frame: Frame) -> None:
         """Once there are enough early pairs of frames, warn if the poses do not fit their depth."""

@@ -257,6 +257,7 @@ def sdf_grid(
     keys: Ints2,  # (Q, 3) lattice corners
     index: ti.template(),
     latents: Floats3,  # (S, l, 1)
+    taken: Bytes1,  # (S,) 0: as if the voxel were not there
     basis: Floats2,  # (R^3, 8 l) tent weight times f_posi of each voxel, at the R^3 samples of a cube
     tents: Floats2,  # (R^3, 8)
     # out:
@@ -267,7 +268,10 @@ def sdf_grid(
         present = ti.Vector([0.0] * 8)
         for o in range(8):
             s = corner_slot(keys, q, o, index)
+            wanted = False
             if s >= 0:
+                wanted = taken[s] != 0
+            if wanted:
                 present[o] = 1.0
                 for a in range(rank):
                     F[o * rank + a] = latents[s, a, 0]

@@ -8,7 +8,7 @@ those that read depth behind it.
 
 import taichi as ti
 
-from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, Votes2, row3
+from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, Rows2, Votes2, row3
 from .camera import Intrinsics
 from .cells import (
     BLOCK_CELLS,
@@ -20,6 +20,7 @@ from .cells import (
     has_cell,
 )
 from .index import INDEX_HALF, find, voxel_of
+from .sides import part_sides
 from .tasks import worker_stride
 
 MOST_VOTES = 127  # votes that a cell can hold, for or against
@@ -211,12 +212,14 @@ def ask_view(
 def vote_cells(
     # in:
     rank: ti.template(),
-    begin: ti.i32,  # the first slot to vote in...
-    end: ti.i32,  # ...and the one after the last
+    slots: ti.types.vector(2, ti.i32),  # the first slot to vote in, and the one after the last
     keys: Ints2,  # (S, 3)
     masks: Masks2,  # (S, 2) cells with support
     latents: Floats3,  # (S, l, 1)
-    features: Floats3,  # (64, 4, l) f_posi and its gradient by voxel units at the cells' centres
+    backs: Rows2,  # (S, l), or one row where the map does not keep sides apart
+    side_weights: Floats2,  # (S, 2)
+    # (65, 4, l) f_posi and its gradient by voxel units at the cells' centres, and their mean
+    features: Floats3,
     voxel_size: ti.f32,
     depth: Floats3,  # (K or more, H, W) [m] of K views, 0: no reading
     K: Intrinsics,
@@ -227,15 +230,18 @@ def vote_cells(
     evidence: Votes2,
 ):
     stride = ti.static(worker_stride())
-    for i in range((end - begin + VOTE_TASK - 1) // VOTE_TASK * stride):
+    for i in range((slots[1] - slots[0] + VOTE_TASK - 1) // VOTE_TASK * stride):
         if i % stride == 0:
-            first = begin + i // stride * VOTE_TASK
-            for s in range(first, ti.min(first + VOTE_TASK, end)):
+            first = slots[0] + i // stride * VOTE_TASK
+            for s in range(first, ti.min(first + VOTE_TASK, slots[1])):
                 views = views_of(s, keys, voxel_size, depth, K, T_camera_world)
                 if views != 0:
                     F = ti.Vector([0.0] * rank)
                     for a in range(rank):
                         F[a] = latents[s, a, 0]
+                    two, B = 0, ti.Vector([0.0] * rank)
+                    if side_weights.shape[0] > 1:
+                        two = part_sides(rank, s, features, backs, side_weights, F, B)
                     votes = ti.Vector([0] * BLOCK_CELLS)
                     points = ti.Vector([0.0] * (3 * BLOCK_CELLS))  # all x, then y, then z
                     normals = ti.Vector([0.0] * (3 * BLOCK_CELLS))
@@ -244,6 +250,12 @@ def vote_cells(
                         x, normal = cell_center(cell), ti.Vector([0.0, 0.0, 0.0])
                         if has_cell(masks, s, cell) != 0:
                             x, normal, found = cell_surface(rank, F, cell, features)
+                            if two != 0:  # the nearer side
+                                y, other, seen_too = cell_surface(rank, B, cell, features)
+                                center = cell_center(cell)
+                                nearer = (y - center).norm_sqr() < (x - center).norm_sqr()
+                                if seen_too and (nearer or not found):
+                                    x, normal, found = y, other, True
                             if found:
                                 surface[cell // HALF] |= cell_bit(cell % HALF)
                         for d in ti.static(range(3)):

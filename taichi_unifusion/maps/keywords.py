@@ -35,6 +35,7 @@ class SurfaceKeywords(MapKeywords, total=False):
     support_points: int
     support_closing: int
     carve: bool
+    two_sides: bool
     min_evidence: float
 
 

@@ -125,6 +125,8 @@ class LocalLim:
     support: DeviceArray  # (B, 2) cells in which surface was seen
     channels: int  # that were encoded
     first: int = 0  # of them, the first that is meant
+    # of what several windows saw: as `VoxelData.sides`. None: which side one shows is told by F'
+    sides: tuple[NDArray, ...] | None = None
 
     def check(self) -> None:
         """Raise RuntimeStateError where its loan is over."""

@@ -8,7 +8,7 @@ latents.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING
@@ -22,11 +22,13 @@ from ..kernels import marching_cubes as kernels
 from ..kernels import query
 from ..kernels.cells import CELLS
 from ..kernels.visibility import interpolate_evidence
+from ..runtime import DeviceArray
 from ..types import Mesh
 from .cube_tables import STEPS, marching_cubes_tables
 from .encoding import PositionEncoding
 
 if TYPE_CHECKING:
+    from .sheets import Sheet
     from .voxel_grid import VoxelGrid
 
 # a lattice point as one integer, of the same order: its three indices and their offset
@@ -46,6 +48,7 @@ def extract_mesh(
     resolution: int,
     support_closing: int,
     min_evidence: float,
+    sheets: Sequence[Sheet],
     blocks: NDArray[np.int32] | None = None,
 ) -> Mesh:
     """Zero level of the blended field on `resolution`^3 cells a voxel, only where cells are
@@ -54,23 +57,36 @@ def extract_mesh(
     A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map
     holds evidence, the mesh ends on the line where evidence falls below `min_evidence`.
     """
-    codes, support = _cubes(grid, support_closing, resolution, blocks)
-    if not len(codes):
+    parts, inside = [], []
+    for sheet in sheets:
+        codes, support = _cubes(grid, sheet.masks, support_closing, resolution, blocks)
+        if sheet.near is not None:
+            codes, support = _near(codes, support, sheet.near, resolution)
+        if not len(codes):
+            continue
+        keys = _keys(codes)
+        sdf = np.empty((len(keys), resolution**3), np.float32)
+        query.sdf_grid(
+            encoding.settings.rank,
+            keys,
+            grid.index,
+            sheet.latents,
+            sheet.taken,
+            *grid_basis(encoding, resolution),
+            sdf,
+        )
+        vertices, faces, triangles = _march(
+            keys, _upper_cubes(codes), support, sdf, resolution, voxel_size
+        )
+        parts.append((vertices, faces))
+        if blocks is not None:
+            inside.append(np.repeat(_lie_in(keys, blocks), triangles))
+    if not parts:
         return Mesh(
             np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32)
         )
-    keys, upper = _keys(codes), _upper_cubes(codes)
-    sdf = np.empty((len(keys), resolution**3), np.float32)
-    query.sdf_grid(
-        encoding.settings.rank,
-        keys,
-        grid.index,
-        grid["latents"],
-        *grid_basis(encoding, resolution),
-        sdf,
-    )
-    vertices, faces, triangles = _march(keys, upper, support, sdf, resolution, voxel_size)
-    wanted = None if blocks is None else np.repeat(_lie_in(keys, blocks), triangles)  # (F,)
+    vertices, faces = parts[0] if len(parts) == 1 else _welded(parts)
+    wanted = None if blocks is None else np.concatenate(inside)  # (F,)
     if "evidence" in grid and len(faces):
         evidence = np.empty(len(vertices), np.float32)
         interpolate_evidence(
@@ -84,6 +100,30 @@ def extract_mesh(
     mesh = Mesh(vertices, faces, fill_normals(_unit(sums), vertices, faces))
     # the cubes around a block were there for the normals on its border
     return mesh if wanted is None else mesh.part(wanted)[0]
+
+
+def _near(
+    codes: NDArray[np.int64],
+    support: NDArray[np.uint32],
+    voxels: NDArray[np.int32],
+    resolution: int,
+) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
+    """Of the cubes those that some voxels (N, 3) reach into, closed as `_cubes` gives them."""
+    reached = np.isin(codes, _with_upper(np.unique(_codes(voxels))))
+    reached &= (support[:, 0] | support[:, 1]) != 0
+    return _closed(codes[reached], support[reached], resolution)
+
+
+def _welded(
+    parts: Sequence[tuple[NDArray[np.float32], NDArray[np.int32]]],
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """One mesh of two, whose vertices at the very same places are one."""
+    (vertices, faces), (more, other) = parts
+    rows = np.concatenate([vertices, more])
+    _, first, number = np.unique(rows.view("V12").ravel(), return_index=True, return_inverse=True)
+    kept = np.sort(first)
+    at = np.searchsorted(kept, first)[number.reshape(-1)].astype(np.int32)
+    return rows[kept], np.concatenate([at[faces], at[other + len(vertices)]])
 
 
 def mesh_blocks(keys: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -225,6 +265,7 @@ def parts_by_pieces(
 
 def _cubes(
     grid: VoxelGrid,
+    masks: DeviceArray,
     support_closing: int,
     resolution: int,
     blocks: NDArray[np.int32] | None = None,
@@ -239,9 +280,16 @@ def _cubes(
         codes = np.compress(np.any(beside, axis=0), codes)
     support = np.empty((len(codes), 2), np.uint32)
     if len(codes):
-        query.corner_support(_keys(codes), grid.index, grid["masks"], support_closing, support)
+        query.corner_support(_keys(codes), grid.index, masks, support_closing, support)
     with_surface = (support[:, 0] | support[:, 1]) != 0
     codes, support = np.compress(with_surface, codes), np.compress(with_surface, support, axis=0)
+    return _closed(codes, support, resolution)
+
+
+def _closed(
+    codes: NDArray[np.int64], support: NDArray[np.uint32], resolution: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
+    """Cubes that hold surface, and those that close one that does, without support."""
     # the last cells of a cube need the samples above
     low, high = np.ascontiguousarray(support.T)
     wanted = [

@@ -56,7 +56,6 @@ class Part:
         """Fuse to each map its part; by name how many voxels that were."""
         fused = {}
         for each, part in self._split(local):
-            each.compare(part)
             fused[each.name] = each.grid.fuse(part)
         return fused
 

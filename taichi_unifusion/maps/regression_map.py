@@ -6,16 +6,18 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..kernels import fusion
+from ..kernels import fusion, sides
 from ..kernels.cells import BLOCK_CELLS
 from ..kernels.keeping import round_rows
 from ..kernels.layout import Layout
 from ..kernels.patches import Patches, Values
+from ..runtime import DeviceArray
 from ..types import PointCloud
 from .base_map import BaseMap, Integration, S, check_cloud
 from .binner import Binner
@@ -39,6 +41,9 @@ class RegressionGrid(VoxelGrid):
     def __init__(self, layout: Layout, noise: float, more: Sequence[VoxelField] = ()) -> None:
         super().__init__(regression_fields(layout, tuple(more)))
         self.layout, self.noise = layout, noise
+        self.lean: DeviceArray | None = (
+            None  # (l,) tells which local LIMs show backs; None: no matter
+        )
         self.steps = 0.0  # of 1, to which local LIMs are rounded; 0: they are fused as they are
 
     def sum_exactly(self, steps: float = STEPS) -> None:
@@ -49,17 +54,31 @@ class RegressionGrid(VoxelGrid):
         name = "sums" if layout.information else "totals"
         columns = layout.sums if layout.information else 1 + layout.latent_rows * layout.channels
         before = self["sums"].to_numpy() if layout.information and self.count else None
-        self.add_pool(SUPPORTED)
         self.add_pool(VoxelField(name, np.dtype(np.float64), (columns,)))
+        counted = ["supported"]
+        if self.lean is not None:
+            self.add_pool(VoxelField("back_totals", np.dtype(np.float64), (columns,)))
+            counted += ["front_supported", "back_supported"]
+        for each in counted:
+            self.add_pool(replace(SUPPORTED, name=each))
         if not self.count:
             return
         if before is None:
-            weights = self["weights"].to_numpy().astype(np.float64)
-            latents = self["latents"].to_numpy().reshape(len(weights), -1)
-            before = np.column_stack([weights, np.rint(latents * steps) / steps * weights[:, None]])
+            before = self._totals(self["weights"].to_numpy(), "latents")
         self[name].from_numpy(before.astype(np.float64))
-        words = self["masks"].to_numpy().astype(">u4").view(np.uint8)
-        self["supported"].from_numpy(np.unpackbits(words, axis=1).astype(np.uint16))
+        if self.lean is not None:
+            self["back_totals"].from_numpy(
+                self._totals(self["side_weights"].to_numpy()[:, 1], "backs")
+            )
+        for each in counted:
+            words = self[each.replace("supported", "masks")].to_numpy().astype(">u4").view(np.uint8)
+            self[each].from_numpy(np.unpackbits(words, axis=1).astype(np.uint16))
+
+    def _totals(self, weights: NDArray[np.float32], name: str) -> NDArray[np.float64]:
+        """(S, 1 + r c) sums of w (S,) and F w, to steps."""
+        w, F = weights.astype(np.float64), self[name].to_numpy().astype(np.float64)
+        F = np.rint(F.reshape(len(w), -1) * self.steps) / self.steps
+        return np.column_stack([w, F * w[:, None]])
 
     def fuse(self, local: LocalLim) -> int:
         """F <- (F w + F' w') / (w + w'), or the sums of one regression over all frames; returns the
@@ -117,6 +136,29 @@ class RegressionGrid(VoxelGrid):
             fusion.fuse_exactly(*what, int(sign), self["totals"], *maps)
         else:
             fusion.fuse(*what, support, sign, *maps, self["masks"])
+        if self.lean is not None:
+            self._fuse_sides(local, slots, sign)
+
+    def _fuse_sides(self, local: LocalLim, slots: NDArray[np.int32], sign: float) -> None:
+        """Fuse what shows backs once more, into a mean of its own; note weight and support of both sides."""
+        n, given = local.count, local.sides
+        if given is None:
+            encoded, weights = local.encoded, np.zeros((max(n, 1), 2), np.float32)
+            sides.weigh_sides(n, self.lean, encoded, local.weights, weights)
+            front, back = (np.where(w > 0, slots[:n], -1).astype(np.int32) for w in weights[:n].T)
+            support = (front, local.support), (back, local.support)
+        else:
+            encoded, weights = given[0].astype(np.float32)[:, :, None], given[1]
+            support = (slots, given[2]), (slots, given[3])
+        totals = self["back_totals"] if self.steps else np.zeros((1, 1))
+        what = self.layout.rank, bool(self.steps), n, slots, encoded, weights, int(sign)
+        sides.fuse_sides(*what, totals, self["backs"], self["side_weights"])
+        for side, (rows, cells) in zip(("front", "back"), support, strict=True):
+            if self.steps:
+                counts = self[f"{side}_supported"]
+                fusion.count_support(n, rows, cells, int(sign), counts, self[f"{side}_masks"])
+            elif sign > 0:
+                sides.note_support(n, rows, cells, self[f"{side}_masks"])
 
 
 class RegressionMap(BaseMap[S]):
@@ -196,9 +238,6 @@ class RegressionMap(BaseMap[S]):
         it is taken out (-1). Only SurfaceMap does.
         """
 
-    def compare(self, local: LocalLim) -> None:
-        """Hook: look at a local LIM beside what the map holds, before it is fused. Only SurfaceMap does."""
-
     def usable(self, cloud: PointCloud) -> PointCloud:
         """The cloud without the points at which something observed is NaN or infinite."""
         observed = self.observed(cloud)
@@ -218,5 +257,6 @@ class RegressionMap(BaseMap[S]):
             data.weights,
             data.masks,
             self.channels,
+            sides=data.sides,
         )
         self.grid.fuse(local)

@@ -104,6 +104,10 @@ class SurfaceSettings(MapSettings):
     pinholes; 27: none, 1: a rim all around."""
     carve: bool = True
     """Cut the mesh where more frames saw through the surface than saw it."""
+    two_sides: bool = True
+    """Keep apart what is seen from opposite sides, so that a board thinner than a voxel gets both of its
+    faces; not with fusion: information.
+    """
     min_evidence: float = 0.5
     """With `carve`: keep surface that at least this many more frames saw than saw through, between
     cells in proportion; 1.5 asks for two frames.

@@ -63,6 +63,8 @@ KINDS = {
 }
 
 
+# what maps of older files are, whose settings say nothing of it
+BEFORE = {"surface": {"two_sides": False}}
 _EXACT = {  # type of a setting -> those that it has in JSON, and their name
     float: ((float, int), "a number"),
     int: ((int,), "a whole number"),
@@ -182,7 +184,10 @@ def _described(path: object, manifest: Mapping[str, Any]) -> MapDescription:
         _check_keys(manifest, (*MANIFEST_KEYS, *CONTAINER_KEYS), "")
         kind = exact(manifest.get("kind"), Literal[tuple(KINDS)], "kind")
         known = KINDS[kind]
-        settings = _settings(known.settings, manifest.get("settings"), "settings")
+        given = manifest.get("settings")
+        if isinstance(given, dict):
+            given = {**BEFORE.get(kind, {}), **given}
+        settings = _settings(known.settings, given, "settings")
         if not settings.voxel_size:  # one that is not chosen yet: no map has that
             raise InputError("settings: voxel_size is missing or 0")
         description = MapDescription(

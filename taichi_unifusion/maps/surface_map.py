@@ -4,6 +4,7 @@ surfaces (Sec. IV-B).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Self, Unpack
 
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from .. import runtime
 from ..errors import InputError, check_box, check_range, check_whole, shortened
 from ..geometry.checks import as_numbers
-from ..kernels import sides, visibility
+from ..kernels import visibility
 from ..kernels.cells import CELLS
 from ..kernels.patches import Patches, Values
 from ..runtime import DeviceArray
@@ -26,8 +27,8 @@ from .local_lim import LocalLim
 from .meshing import blocks_in, drop_small_parts, extract_mesh
 from .regression_map import RegressionMap
 from .settings import MAX_RESOLUTION, SurfaceSettings
-from .sides import LOOKED_AT, Sides
-from .voxel_data import EVIDENCE, VoxelData, surface_layout
+from .sheets import FRONT, Sheet, sheets_of, whole
+from .voxel_data import VoxelData, surface_extras, surface_layout
 
 
 class SurfaceMap(RegressionMap[SurfaceSettings]):
@@ -50,11 +51,12 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
     ) -> None:
         settings = settings_of(SurfaceSettings, settings, dict(keywords), "SurfaceMap")
         layout = surface_layout(settings)
-        super().__init__("surface", 1, settings, layout, [EVIDENCE] * settings.carve)
+        super().__init__("surface", 1, settings, layout, surface_extras(settings))
+        if self.two_sides:
+            self.grid.lean = to_device(FRONT @ self._cell_features[CELLS**3, 1:])
         beside = settings.sample_distance
         steps = (0.0,) if settings.gpis == "derivatives" else (-beside, 0.0, beside)
         self.steps = np.array(steps, np.float32)  # of samples along a normal [voxels]
-        self.sides = Sides(0, 0)
         self.binner = SurfelBinner(
             self.grid,
             settings.voxel_size,
@@ -115,25 +117,6 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         T_camera_world = np.ascontiguousarray(view.T_camera_cloud[None, :3], dtype=np.float32)
         self.vote(view.values[None], view.camera, T_camera_world, (0, grid.count), sign)
 
-    def compare(self, local: LocalLim) -> None:
-        """Count voxels whose surface a window saw from the other side than windows before."""
-        if self.layout.information:
-            return
-        counts = np.zeros(2, np.int32)
-        sides.count_sides(
-            self.layout.rank,
-            local.count,
-            local.keys,
-            local.weights,
-            local.encoded,
-            self.grid.index,
-            self.grid["latents"],
-            self.side_gradients,
-            counts,
-        )
-        runtime.synchronize()
-        self.sides += Sides(int(counts[0]), int(counts[1]))
-
     @runtime.compiled_sooner()
     def vote(
         self,
@@ -146,13 +129,15 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         """Let the depth images (K, H, W) of K views, taken from poses (K, 3, 4), vote in the voxels
         of a range of slots; with sign -1 they take their votes back.
         """
-        grid = self.grid
+        grid, none = self.grid, (np.zeros((1, 1), np.float16), np.zeros((1, 2), np.float32))
+        backs = (grid["backs"], grid["side_weights"]) if self.two_sides else none
         visibility.vote_cells(
             self.layout.rank,
-            *slots,
+            slots,
             grid["keys"],
             grid["masks"],
             grid["latents"],
+            *backs,
             self.cell_gradients,
             self.voxel_size,
             depth,
@@ -162,19 +147,29 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
             grid["evidence"],
         )
 
-    @cached_property
-    def cell_gradients(self) -> DeviceArray:
-        """(4^3, 4, l): f_posi and its gradient by voxel units at the centres of a voxel's own
-        cells.
-        """
-        encoding = self.encoder.tables.encoding
-        t = encoding.nodes(CELLS) / 2  # a voxel is the inner half of its doubled voxel
-        return to_device(np.concatenate([encoding(t)[:, None], 0.5 * encoding.gradient(t)], axis=1))
+    @property
+    def two_sides(self) -> bool:
+        """Whether opposite sides are kept apart."""
+        return "side_weights" in self.grid
+
+    def _sheets(self) -> Sequence[Sheet]:
+        if not self.two_sides:
+            return (whole(self.grid),)
+        return sheets_of(self.grid, self._cell_features)
 
     @cached_property
-    def side_gradients(self) -> DeviceArray:
-        """(P, 3, l): the gradient of f_posi by voxel units where `compare` looks at a voxel."""
-        return to_device(0.5 * self.encoder.tables.encoding.gradient(LOOKED_AT / 2))
+    def cell_gradients(self) -> DeviceArray:
+        """(4^3 + 1, 4, l): f_posi and its gradient by voxel units at the centres of a voxel's own
+        cells, and their mean.
+        """
+        return to_device(self._cell_features)
+
+    @cached_property
+    def _cell_features(self) -> NDArray[np.float32]:
+        encoding = self.encoder.tables.encoding
+        t = encoding.nodes(CELLS) / 2  # a voxel is the inner half of its doubled voxel
+        cells = np.concatenate([encoding(t)[:, None], 0.5 * encoding.gradient(t)], axis=1)
+        return np.concatenate([cells, cells.mean(axis=0, keepdims=True)]).astype(np.float32)
 
     def fuse_voxels(self, data: VoxelData) -> None:
         super().fuse_voxels(data)
@@ -190,7 +185,8 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         it, and where it is known (N,): within about a voxel of the surface, to some per cent.
 
         Elsewhere the value has the field's sign, where a voxel is, and says no distance; 0 where there
-        is none.
+        is none. At boards thinner than a voxel, whose sides only meshes keep apart, it is the mean of
+        both sides' fields.
         """
         self.flush()
         runtime.check_alive(self.grid.runtime)
@@ -248,6 +244,7 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
             resolution,
             self.settings.support_closing,
             self.settings.min_evidence,
+            self._sheets(),
             blocks,
         )
         if box is not None:

@@ -38,12 +38,21 @@ KEYS = VoxelField("keys", np.dtype(np.int32), (3,))
 WEIGHTS = VoxelField("weights", np.dtype(np.float32))
 MASKS = VoxelField("masks", np.dtype(np.uint32), (2,))  # support of the voxel's cells
 # frames that saw surface in a cell minus frames that saw through it
+# w of the local LIMs that show fronts, and backs, and their support
+SIDE_WEIGHTS = VoxelField("side_weights", np.dtype(np.float32), (2,))
+FRONT_MASKS = VoxelField("front_masks", np.dtype(np.uint32), (2,))
+BACK_MASKS = VoxelField("back_masks", np.dtype(np.uint32), (2,))
 EVIDENCE = VoxelField("evidence", np.dtype(np.int8), (BLOCK_CELLS,))
 
 
 def latents(rows: int, channels: int) -> VoxelField:
     """The field of latents (r, c): F, and a prior mean."""
     return VoxelField("latents", np.dtype(np.float32), (rows, channels))
+
+
+def backs(rank: int) -> VoxelField:
+    """The field of latents (l,) of backs: their mean F."""
+    return VoxelField("backs", np.dtype(np.float16), (rank,))
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,17 @@ class VoxelData:
     def evidence(self) -> NDArray[np.int8] | None:
         """(N, 64) frames for a cell minus frames against it; None where the map counts none."""
         return self.fields.get("evidence")
+
+    @property
+    def sides(self) -> tuple[NDArray, ...] | None:
+        """F (N, l) of backs, w (N, 2) of fronts and backs, the support (N, 2) of fronts, of backs; None
+        where the map does not keep them apart.
+        """
+        if "backs" not in self.fields:
+            return None
+        return tuple(
+            self.fields[name] for name in ("backs", "side_weights", "front_masks", "back_masks")
+        )
 
     @property
     def sums(self) -> NDArray[np.float32] | None:
@@ -115,9 +135,16 @@ def regression_fields(layout: Layout, more: tuple[VoxelField, ...] = ()) -> tupl
     return (latents(layout.latent_rows, layout.channels), WEIGHTS, MASKS, *more, *sums)
 
 
+def surface_extras(settings: SurfaceSettings) -> tuple[VoxelField, ...]:
+    """What a surface map holds of a voxel that other maps do not."""
+    sides = (backs(settings.encoder.rank), SIDE_WEIGHTS, FRONT_MASKS, BACK_MASKS)
+    apart = settings.two_sides and settings.fusion == "mean"
+    return (EVIDENCE,) * settings.carve + sides * apart
+
+
 def surface_fields(settings: SurfaceSettings) -> tuple[VoxelField, ...]:
     """What a surface map holds of a voxel beside its key."""
-    return regression_fields(surface_layout(settings), (EVIDENCE,) * settings.carve)
+    return regression_fields(surface_layout(settings), surface_extras(settings))
 
 
 def property_fields(channels: int, settings: PropertySettings) -> tuple[VoxelField, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import reference
@@ -36,9 +38,22 @@ def voxels() -> dict[tuple, reference.Voxel]:
         plane = (twin.CENTERS - rng.uniform(0.2, 0.8, 3)) @ normal / np.linalg.norm(normal)
         # some of them too flat
         F = np.linalg.lstsq(features, plane[:, None], rcond=None)[0] * rng.choice([0.01, 1, 1, 1])
-        found[key] = reference.Voxel(
-            F.astype(np.float32).astype(float), 5.0, rng.uniform(size=64) < 0.5
-        )
+        F = F.astype(np.float32).astype(float)
+        found[key] = reference.Voxel(F, 5.0, rng.uniform(size=64) < 0.5)
+    return found
+
+
+@pytest.fixture(scope="module")
+def boards(voxels) -> dict[tuple, reference.Voxel]:
+    """The same, most of which have two sides, a few centimetres apart."""
+    rng, encoder = np.random.default_rng(3), reference.Encoder(ENCODER.rank, ENCODER.anchors)
+    thin = np.linalg.lstsq(encoder((twin.CENTERS - 0.5) / 2), np.full(64, 0.3), rcond=None)[0]
+    found = {}
+    for key, voxel in voxels.items():
+        back = (-voxel.F[:, 0] - thin).astype(np.float16).astype(float)
+        both = ((2 * voxel.F[:, 0] + 3 * back) / 5).astype(np.float32).astype(float)[:, None]
+        weight = rng.choice([0.0, 3.0, 3.0, 5.0])
+        found[key] = reference.Voxel(both, 5.0, voxel.mask, (back, 5.0 - weight, weight))
     return found
 
 
@@ -64,12 +79,15 @@ def vote(
     """Votes of a view, or of several: depth (H, W) or (K, H, W) and T (4, 4) or (K, 4, 4)."""
     target = SurfaceMap(encoder=ENCODER)
     keys = np.array(list(voxels), np.int32)
+    sides = [v.back or (np.zeros(ENCODER.rank), v.w, 0.0) for v in voxels.values()]
     kernels.vote_cells(
         ENCODER.rank,
-        *(slots or (0, len(keys))),
+        slots or (0, len(keys)),
         keys,
         pack_masks(np.array([v.mask for v in voxels.values()])),
         np.array([v.F for v in voxels.values()], np.float32),
+        np.array([back for back, *_ in sides], np.float16),
+        np.array([weights for _, *weights in sides], np.float32),
         target.cell_gradients.to_numpy(),
         VS,
         depth.reshape(-1, CAMERA.height, CAMERA.width),
@@ -103,6 +121,18 @@ def test_vote_cells_equals_its_twin(voxels, depth, T):
     assert min((wanted == v).sum() for v in (-1, 1)) > 100 and (evidence != wanted).mean() < FLIPPED
     vote(voxels, depth, T, -1, evidence)
     assert not evidence.any()
+
+
+def test_both_sides_of_a_board_are_voted_for(boards, depth):
+    """In a cell the nearer of the two surfaces is asked for, as the twin does."""
+    T, evidence = pose((0.003, 0.0017, -0.0021)), np.zeros((len(boards), 64), np.int8)
+    vote(boards, depth, T, 1, evidence)
+    encoder = reference.Encoder(ENCODER.rank, ENCODER.anchors)
+    wanted, one = (
+        np.array(list(twin.vote_cells(encoder, each, VS, [depth], CAMERA, [T]).values()))
+        for each in (boards, {key: replace(v, back=None) for key, v in boards.items()})
+    )
+    assert (evidence != wanted).mean() < FLIPPED < 0.01 < (one != wanted).mean()
 
 
 def test_votes_of_several_views_are_those_of_each_and_equal_their_twin(voxels, depth):

@@ -289,13 +289,14 @@ def test_cubes_left_out_have_no_part_in_the_mesh(resolution):
     target.grid.add(voxels)
     meshes = []
     for codes, support in (
-        meshing._cubes(target.grid, 14, resolution),
+        meshing._cubes(target.grid, target.grid["masks"], 14, resolution),
         all_cubes(target.grid, 14),
     ):
         keys, upper = meshing._keys(codes), meshing._upper_cubes(codes)
         sdf = np.empty((len(keys), resolution**3), np.float32)
         basis = meshing.grid_basis(target.encoder.tables.encoding, resolution)
-        meshing.query.sdf_grid(6, keys, target.grid.index, target.grid["latents"], *basis, sdf)
+        grid, taken = target.grid, np.ones(target.grid.count, np.uint8)
+        meshing.query.sdf_grid(6, keys, grid.index, grid["latents"], taken, *basis, sdf)
         meshes.append((len(keys), meshing._march(keys, upper, support, sdf, resolution, VS)))
     (few, mesh), (many, whole) = meshes
     assert few < many and len(mesh[1]) > 20

@@ -1,88 +1,104 @@
-"""A board thinner than a voxel is noticed, and said with what to do; a room is not."""
+"""Boards thinner than a voxel get both of their faces, also from saved, merged and moved maps."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import reference_visibility as twin
+from mesh_laws import assert_welded
 from places import DEVICE
 
 import taichi_unifusion as uf
 from taichi_unifusion.datasets.synthetic import Scene, SyntheticRoom, look_at
-from taichi_unifusion.kernels import sides as kernels
-from taichi_unifusion.maps.sides import Sides
-from taichi_unifusion.maps.voxel_data import MASKS, WEIGHTS
-from taichi_unifusion.maps.voxel_grid import VoxelGrid
+from taichi_unifusion.maps import SurfaceMap, load_map
 from taichi_unifusion.rendering.primitives import box
+from taichi_unifusion.rendering.raycaster import RayCaster
 from taichi_unifusion.rendering.room import furnished_room
+from taichi_unifusion.types import Mesh, PinholeCamera
+
+VIEWS = 10
 
 
 class Board(SyntheticRoom):
-    """A board that stands in an empty room, seen from all around."""
+    """A board of a metre that stands in an empty room, seen from all around."""
 
     def __init__(self, thickness: float) -> None:
-        super().__init__(frames=8, width=160, height=120)
+        super().__init__(frames=VIEWS, width=240, height=180)
         self.T_world_camera = np.stack(
             [
-                look_at((1.4 * np.cos(a), 1.4 * np.sin(a), 1.1), (0, 0, 1))
-                for a in np.arange(8) * np.pi / 4
+                look_at((1.4 * np.cos(a), 1.4 * np.sin(a), 1.1 + 0.3 * np.sin(2 * a)), (0, 0, 1))
+                for a in (np.arange(VIEWS) + 0.5) * 2 * np.pi / VIEWS
             ]
         )
-        room = furnished_room()[0]
-        y = thickness / 2
+        room, y = furnished_room()[0], thickness / 2
         # takes the place of the furnished room, which is made when it is first needed
         self.__dict__["_scene"] = Scene((room, box(room.material, (-0.5, -y, 0.5), (0.5, y, 1.5))))
 
 
 @pytest.fixture(scope="module")
-def warned():
+def board_map():
     uf.init(DEVICE)
+    made = {}
 
-    def run(frames) -> list[str]:
-        result = uf.Pipeline(uf.Config(device=DEVICE, voxel_size=0.05)).run(frames)
-        return [warning for warning in result.warnings if "faces the other way" in warning]
+    def make(thickness: float, **settings) -> SurfaceMap:
+        key = thickness, *settings.items()
+        if key not in made:
+            surface = uf.maps.SurfaceSettings(voxel_size=0.05, **settings)
+            pipeline = uf.Pipeline(uf.Config(device=DEVICE, surface=surface))
+            for frame in Board(thickness):
+                pipeline.step(frame)
+            made[key] = pipeline.surface
+        return made[key]
 
-    return run
-
-
-def test_a_thin_board_is_said_with_what_to_do(warned):
-    (sentence,) = warned(Board(0.02))
-    assert "voxels of 5 cm" in sentence and "--detail fine or --voxel-size 0.02" in sentence
-
-
-def test_a_thick_board_and_a_furnished_room_are_not(warned):
-    assert warned(Board(0.3)) == []
-    assert warned(SyntheticRoom(frames=8, width=160, height=120)) == []
+    return make
 
 
-def test_sides_add_up():
-    assert Sides(2, 1) + Sides(3, 0) == Sides(5, 1)
+def within(mesh: Mesh, thickness: float, tolerance: float = 0.005) -> tuple[float, float]:
+    """The share of a face that is met within a tolerance of where it is, from either side; 3 cm along
+    its rim left out.
+    """
+    camera = PinholeCamera(95, 95, 100.0, 100.0, 47.0, 47.0)  # sees the face from a metre
+    shares = []
+    for side in (1, -1):
+        eye = np.array([0.0, side * (1 + thickness / 2), 1.0])
+        depth = RayCaster(mesh).cast(camera, look_at(eye, (0, 0, 1))).depth
+        shares.append(float((np.abs(depth - 1) < tolerance).mean()))
+    return shares[0], shares[1]
 
 
-def test_count_sides_equals_its_twin():
-    """Voxels that the map does not hold, or that were not encoded, are not looked at."""
-    rng, grid, rank = np.random.default_rng(0), VoxelGrid([WEIGHTS, MASKS]), 8
-    slopes = rng.normal(size=(9, 3, rank)).astype(np.float32)
-    keys = np.unique(rng.integers(-9, 9, (900, 3)), axis=0).astype(np.int32)
-    known, weights = np.arange(len(keys)) % 4 > 0, np.arange(len(keys)) % 5 % 3 + 0.0
-    slots = np.empty(len(keys), np.int32)
-    grid.claim(len(keys), keys, known.astype(np.float32), slots)
-    latents = rng.normal(size=(grid.capacity, rank, 1)).astype(np.float32)
-    turned = rng.choice([-1.0, 0.0, 0.02, 1.0], len(keys))[:, None, None]
-    encoded = (latents[slots] * turned + 0.1 * rng.normal(size=(len(keys), rank, 1))) * 0.2
-    encoded, counts = encoded.astype(np.float32), np.array([10, 20], np.int32)
-    kernels.count_sides(
-        rank,
-        len(keys),
-        keys,
-        weights.astype(np.float32),
-        encoded,
-        grid.index,
-        0.2 * latents,
-        slopes,
-        counts,
-    )
-    looked_at = known & (weights > 0)
-    wanted = twin.count_sides(0.2 * latents[slots[looked_at]], encoded[looked_at], slopes)
-    assert 0 < wanted[1] < wanted[0] < looked_at.sum()
-    np.testing.assert_array_equal(counts, np.array([10, 20]) + wanted)
+@pytest.mark.parametrize("thickness", [0.01, 0.02, 0.03])
+def test_F_both_faces_of_a_board_are_where_they_are(board_map, thickness):
+    mesh = board_map(thickness).extract_mesh(4)
+    assert_welded(mesh.vertices, mesh.faces)
+    assert min(within(mesh, thickness)) > 0.9
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-4)
+
+
+def test_one_field_a_voxel_cannot_hold_both(board_map):
+    assert max(within(board_map(0.02, two_sides=False).extract_mesh(4), 0.02)) < 0.3
+
+
+def test_a_saved_map_and_the_sum_of_two_have_both_faces_too(board_map, tmp_path):
+    whole = board_map(0.02)
+    whole.save(tmp_path / "board.safetensors")
+    loaded = load_map(tmp_path / "board.safetensors")
+    meshes = [each.extract_mesh(2) for each in (whole, loaded)]
+    np.testing.assert_array_equal(meshes[0].faces, meshes[1].faces)
+    np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)
+    parts = []
+    for side in (1, -1):
+        pipeline = uf.Pipeline(uf.Config(device=DEVICE, voxel_size=0.05))
+        for frame in Board(0.02):
+            if side * frame.T_world_camera[1, 3] > 0:
+                pipeline.step(frame)
+        parts.append(pipeline.surface)
+    assert min(within(parts[0].extract_mesh(4), 0.02)) < 0.1
+    parts[0].merge(parts[1])
+    assert min(within(parts[0].extract_mesh(4), 0.02)) > 0.9
+
+
+def test_a_room_has_one_sheet(board_map):
+    pipeline = uf.Pipeline(uf.Config(device=DEVICE, voxel_size=0.05))
+    for frame in SyntheticRoom(frames=8, width=160, height=120):
+        pipeline.step(frame)
+    pipeline.surface.flush()
+    assert [sheet.near for sheet in pipeline.surface._sheets()] == [None]

@@ -274,6 +274,20 @@ def test_M10_a_repaired_map_lacks_the_damaged_voxels_alone(kind, files, tmp_path
     assert len(load_map(tmp_path / "again")) == len(left)
 
 
+def test_M9_a_surface_of_before_sides_were_kept_apart(tmp_path):
+    """Its settings say nothing of sides, and it has none."""
+    path = tmp_path / "old.safetensors"
+    written = integrated(SurfaceMap(two_sides=False, **SMALL), frames()[:1])
+    manifest = {**written.manifest(), "voxels": len(written)}
+    manifest["settings"] = {
+        name: value for name, value in manifest["settings"].items() if name != "two_sides"
+    }
+    write_map(path, written.voxels().tensors, manifest)
+    read = load_map(path)
+    assert read.settings == written.settings and read.settings.two_sides is False
+    np.testing.assert_array_equal(read.voxels().latents, written.voxels().latents)
+
+
 def test_M9_a_file_of_version_1_is_read_for_ever(tmp_path):
     """Written byte by byte as version 1 has it, not by today's writer: do not renew it."""
     keys = np.array([[0, 0, 0], [0, 0, 1]], "<i4")

@@ -170,6 +170,8 @@ class Voxel:
     F: np.ndarray  # (l [+ 1], c)
     w: float
     mask: np.ndarray  # (64,) support
+    # F (l,) of what shows its back, and w of fronts and backs
+    back: tuple[np.ndarray, float, float] | None = None
 
 
 def rows_by(keys):
@@ -497,11 +499,8 @@ def tent_sum(voxels, corner, resolution):
     u = np.stack(
         np.meshgrid(*[np.arange(resolution) / resolution] * 3, indexing="ij"), axis=-1
     ).reshape(-1, 3)
-    return sum(
-        np.prod(1 - np.abs(u - step), axis=1)
-        for step in CORNERS
-        if tuple((corner - 1 + step).tolist()) in voxels
-    )
+    there = (step for step in CORNERS if tuple((corner - 1 + step).tolist()) in voxels)
+    return sum((np.prod(1 - np.abs(u - step), axis=1) for step in there), np.zeros(len(u)))
 
 
 def corner_support(voxels, corner, closing):

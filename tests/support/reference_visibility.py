@@ -10,6 +10,7 @@ from itertools import product
 
 import numpy as np
 from reference import CELLS, CORNERS, cell_number
+from reference_sides import part_sides
 
 # (64, 3) of cells, voxels from the voxel's corner
 CENTERS = (np.array(list(product(range(CELLS), repeat=3))) + 0.5) / CELLS
@@ -86,14 +87,34 @@ def votes_of_view(encoder, voxels, voxel_size, depth, camera, T_camera_world):
                 p = R @ ((key + center) * voxel_size) + origin
                 votes[key][cell] = vote_of_free_cell(p, voxel_size, depth, camera)
                 continue
-            slope = slopes[cell] @ voxel.F[:, 0]
-            steep = np.linalg.norm(slope)
-            distance = f[cell] @ voxel.F[:, 0] / max(steep, 1e-6)
-            if steep > 0.2 and abs(distance) < 0.45:
-                normal = slope / steep
+            near = nearest_surface(f[cell], slopes[cell], fields_of(encoder, voxel))
+            if near is not None:
+                distance, normal = near
                 p = R @ ((key + center - distance * normal) * voxel_size) + origin
                 votes[key][cell] = vote_of_surface(p, R @ normal, voxel_size, depth, camera)
     return votes
+
+
+def fields_of(encoder, voxel):
+    """The latents (l,) of a voxel's fields: one, or one a side."""
+    if voxel.back is None:
+        return [voxel.F[:, 0]]
+    two, front = part_sides(encoder, voxel.F[:, 0], *voxel.back)
+    return [front, voxel.back[0]] if two else [front]
+
+
+def nearest_surface(f, slopes, fields):
+    """Signed distance from a cell's centre to the nearest surface of some fields, and the normal
+    there; None where there is none.
+    """
+    found = []
+    for F in fields:
+        slope = slopes @ F
+        steep = np.linalg.norm(slope)
+        distance = f @ F / max(steep, 1e-6)
+        if steep > 0.2 and abs(distance) < 0.45:
+            found.append((distance, slope / steep))
+    return min(found, key=lambda each: abs(each[0]), default=None)
 
 
 def vote_support(support):
@@ -120,19 +141,3 @@ def interpolate_evidence(evidence, masks, x):
                 total, weight = total + tent * evidence[key][cell], weight + tent
         values[n] = total / weight if weight > 1e-6 else 1.0
     return values
-
-
-def count_sides(before, after, slopes):
-    """Of voxels whose fields (N, l, 1) are given before and in a window: how many have a clear surface
-    in both, and how many of these face the other way. Slopes (P, 3, l) are those of f_posi.
-    """
-    seen, opposite = 0, 0
-    for pair in zip(before[:, :, 0], after[:, :, 0], strict=True):
-        a, b = (
-            max((slope @ F for slope in slopes.astype(float)), key=np.linalg.norm) for F in pair
-        )
-        lengths = np.linalg.norm(a), np.linalg.norm(b)
-        if min(lengths) > 0.5:
-            seen += 1
-            opposite += a @ b < -0.7 * lengths[0] * lengths[1]
-    return seen, opposite
