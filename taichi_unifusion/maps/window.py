@@ -271,8 +271,7 @@ class WindowFusion:
         self._begun: Piece | None = None  # that was handed out, and is not done
         self._rehearsals: list[Piece] = []  # for the first frame that has something for a part
         self._maps: set[RegressionMap] = set()  # that wait
-        # where windows end: the last frame's place in its recording, and the usual step
-        self.borders = (0, 0)
+        self.borders = (0, 0)  # where windows end: the last frame's place, and the usual step
         self._room: dict[tuple[str, ...], tuple[CellArrays, Arena]] = {}
         self._known: dict[tuple[str, ...], Part] = {}
         self._images: list[DeviceArray] = []  # of the open window, and of the one before
