@@ -266,7 +266,6 @@ class WindowFusion:
         self.at_border: Callable[[], None] | None = None  # told when all frames are in the maps
         self.window: Window | None = None
         self._last: Window | None = None  # the window of the last frame, which may be closed
-        self._expected = size  # frames in a window, which mostly end alike
         self.pieces: deque[Piece] = deque()
         self._begun: Piece | None = None  # that was handed out, and is not done
         self._rehearsals: list[Piece] = []  # for the first frame that has something for a part
@@ -335,18 +334,17 @@ class WindowFusion:
         if self.window is not None:
             self.run(len(self.pieces))
             self.pieces.extend(self.window.close(self.keep))
-            self._expected = len(self.window)
             self.window = None
             self.settle()
             self._images.reverse()
 
     def due(self, frames: int = 0) -> Iterator[Piece]:
-        """The pieces to do now, so that all are done when the next window is as long as the one
-        before, or in so many frames.
+        """The pieces to do now, so that all are done when the next window is full, or in so many
+        frames.
         """
         while self._rehearsals:
             yield self._rehearsals.pop(0)
-        frames_left = frames or self._expected - (len(self.window) if self.window else 0)
+        frames_left = frames or self.size - (len(self.window) if self.window else 0)
         for _ in range(-(-len(self.pieces) // max(frames_left, 1))):
             self._begun = self.pieces.popleft()
             yield self._begun
