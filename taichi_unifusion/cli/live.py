@@ -19,7 +19,7 @@ from ..tracking.live import TrackedFrames
 from ..tracking.live import warm_up as warm_up_tracker
 from .color_camera import AUTO, given_color
 from .following import following, keep_store, open_store, settle
-from .interrupts import INTERRUPTED, stop_on_signal
+from .interrupts import INTERRUPTED
 from .options import (
     OutputOptions,
     RecordingOptions,
@@ -30,7 +30,7 @@ from .options import (
 )
 from .replacing import say_what_is_replaced
 from .terminal import frame_progress, report
-from .viewing import WatchOptions, open_watcher
+from .viewing import WatchOptions, run_watched
 
 if TYPE_CHECKING:
     from ..results import RunFolder
@@ -77,28 +77,20 @@ def reconstruct_live(
     """Frames -> tracker -> maps while they come, then mesh -> results folder."""
     from ..pipeline import warm_up
     from ..results.lock import lock_folder
-    from ..results.safe_point import remove_temporaries
     from ..results.writer import prepare_results
 
     source = open_source(recording, poses.tracking, live.live_speed)
     folder = prepare_results(output.out)
+
+    def map_and_write(watcher: Watcher, stop: Callable[[], bool]) -> int:
+        # or the first frames would be dropped while kernels are compiled
+        warm_up(settings)
+        warm_up_tracker(make_tracker(source.tracking, settings.tracking, settings.preprocess))
+        return _map(source, recording.strict, output, settings, folder, stop, watcher)
+
     with lock_folder(folder):
         say_what_is_replaced(folder, output, settings, False, source.tracking != "given")
-        with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
-            watcher = open_watcher(watch, folder.path.name, source.most or 0, stop)
-            # or the first frames would be dropped while kernels are compiled
-            warm_up(settings)
-            warm_up_tracker(make_tracker(source.tracking, settings.tracking, settings.preprocess))
-            try:
-                code = _map(source, recording.strict, output, settings, folder, stop, watcher)
-            except BaseException:
-                watcher.close()
-                raise
-        if code == INTERRUPTED:
-            watcher.close()
-        else:
-            watcher.finish(folder.path)
-    return code
+        return run_watched(watch, folder, source.most or 0, map_and_write)
 
 
 def open_source(asked: RecordingOptions, mode: Mode, speed: float) -> LiveSource:

@@ -28,7 +28,7 @@ from .following import (
     map_in_one_pass,
     open_store,
 )
-from .interrupts import INTERRUPTED, stop_on_signal
+from .interrupts import INTERRUPTED
 from .into import Addition, check_into, maps_of, placed, remembered
 from .live import LiveOptions, reconstruct_live
 from .on_workers import check_workers, remove_shards, run_on_workers
@@ -43,7 +43,7 @@ from .options import (
 from .replacing import say_what_is_replaced
 from .resuming import end_saving, is_complete, make_pipeline, open_saver, registered
 from .terminal import DONE, FAILED, frame_progress, report
-from .viewing import WatchOptions, open_watcher
+from .viewing import WatchOptions, run_watched
 
 if TYPE_CHECKING:
     from ..language import EncoderChoice
@@ -134,35 +134,14 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
         say_what_is_replaced(
             folder, options.output, options.settings, encoder is not None, options.poses.tracked
         )
-        return _fuse_watched(recording, color, options, folder, encoder, up, saver)
-
-
-def _fuse_watched(
-    recording: Dataset,
-    color: ColorRecord,
-    options: Reconstruct,
-    folder: RunFolder,
-    encoder: ImageEncoder | None,
-    up: Up | None,
-    saver: RunSaver,
-) -> int:
-    from ..results.safe_point import remove_temporaries
-
-    frames = len(range(0, len(recording), options.recording.every))
-    with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
-        watcher = open_watcher(options.watch, folder.path.name, frames, stop)
-        try:
-            code = _fuse_and_write(
+        return run_watched(
+            options.watch,
+            folder,
+            frames,
+            lambda watcher, stop: _fuse_and_write(
                 recording, color, options, folder, stop, encoder, up, watcher, saver
-            )
-        except BaseException:
-            watcher.close()
-            raise
-    if code == INTERRUPTED:
-        watcher.close()
-    else:
-        watcher.finish(folder.path)
-    return code
+            ),
+        )
 
 
 def _fuse_and_write(

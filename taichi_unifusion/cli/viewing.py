@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import FlagCreatePairsOff, arg
 
 from ..errors import InputError
+from .interrupts import INTERRUPTED, stop_on_signal
 from .options import EncoderOptions
 from .results_source import results_source
 
 if TYPE_CHECKING:
+    from ..results import RunFolder
     from ..viewer.null import Watcher
     from ..viewer.source import ResultsSource
     from ..viewer.web import WebViewer
@@ -76,3 +78,28 @@ def open_watcher(
         return results_source(path, SceneOptions(), EncoderOptions())
 
     return WebLive(viewer, frames, stop, open_results)
+
+
+def run_watched(
+    options: WatchOptions,
+    folder: RunFolder,
+    frames: int,
+    run: Callable[[Watcher, Callable[[], bool]], int],
+) -> int:
+    """The exit code of `run`, which is given what watches its frames and what says that it is to stop;
+    what watches stays and shows the results, unless the run was stopped or failed.
+    """
+    from ..results.safe_point import remove_temporaries
+
+    with stop_on_signal(clean_up=lambda: remove_temporaries(folder)) as stop:
+        watcher = open_watcher(options, folder.path.name, frames, stop)
+        try:
+            code = run(watcher, stop)
+        except BaseException:
+            watcher.close()
+            raise
+    if code == INTERRUPTED:
+        watcher.close()
+    else:
+        watcher.finish(folder.path)
+    return code
