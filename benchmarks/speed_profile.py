@@ -109,7 +109,7 @@ def _compacting(of: Arguments) -> tuple[float, float]:
 
 def _encoding(of: Arguments) -> tuple[float, float]:
     layout = of["layout"]
-    begin, end = of["slots"]
+    begin, end = of["begin"], of["end"]
     points = _rows(of["rows"], end)[begin:, 1]
     masks, neighbors = _rows(of["masks"], None), _rows(of["neighbors"], end)[begin:]
     seen = _cells(masks[neighbors] & _rows(of["window"], 27))  # (B, 27) cells

@@ -223,6 +223,8 @@ def _is_of(value: object, wanted: Any) -> bool:
     origin, options = get_origin(wanted), get_args(wanted)
     if origin in (Union, UnionType):
         return any(_is_of(value, each) for each in options)
+    if wanted is Path:
+        return isinstance(value, str | os.PathLike)
     if origin is Literal:
         return isinstance(value, str | int)  # `check_choice` names the choices
     if origin is tuple:

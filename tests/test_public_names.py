@@ -23,7 +23,7 @@ PUBLIC = {
         transfer_labels
     """,
     "taichi_unifusion.language": """
-        IMAGE_ENCODERS ImageEncoder TEXT_ENCODERS TextEncoder feature_image
+        EncoderChoice IMAGE_ENCODERS ImageEncoder TEXT_ENCODERS TextEncoder feature_image
         make_image_encoder make_text_encoder unit_length
     """,
     "taichi_unifusion.maps": """

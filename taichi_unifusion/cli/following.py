@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from ..config import Config
 from ..datasets import Dataset
 from ..errors import PoseError
-from ..run_log import SKIP_REASONS, SkippedFrame
 from ..types import Trajectory
 from .color_camera import AUTO
 from .into import Addition, remembered
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
-NO_PLACE = SKIP_REASONS[PoseError]  # of frames that are apart in the end
 
 
 @dataclass(frozen=True)
@@ -207,6 +205,8 @@ def following(pipeline: Pipeline) -> Callable[[CurrentPoses], None]:
 
 def settle(pipeline: Pipeline, run: RunResult, poses: CurrentPoses) -> RunResult:
     """Move all windows to the final poses, if they were kept; returns the run with these."""
+    from ..run_log import SKIP_REASONS, SkippedFrame
+
     if pipeline.follower is None:
         return run
     final = poses.by_frame
@@ -225,7 +225,7 @@ def settle(pipeline: Pipeline, run: RunResult, poses: CurrentPoses) -> RunResult
         )
     used = [i for i, step in enumerate(run.steps) if step.index in final]
     lost = [
-        SkippedFrame(step.index, NO_PLACE, "its place in the map was never sure")
+        SkippedFrame(step.index, SKIP_REASONS[PoseError], "its place in the map was never sure")
         for step in run.steps
         if step.index not in final
     ]

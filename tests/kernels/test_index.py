@@ -206,7 +206,9 @@ def test_the_indices_of_all_maps_count_together(monkeypatch):
 def test_what_a_map_that_is_gone_touched_again_and_again_counts_once():
     """Its tree keeps the memory of the leaves that there were, not of all that was noted."""
     gc.collect()
-    live, grid = runtime.current(), a_grid()
+    live = runtime.current()
+    others = [a_grid() for _ in live.free_trees]  # so that its tree is the only free one
+    grid = a_grid()
     index, before = grid.index, live.earlier.get(grid.index, 0)
     points = np.random.default_rng(5).uniform(-200, 200, (1000, 3)).astype(np.float32)
     for _ in range(9):
@@ -217,6 +219,7 @@ def test_what_a_map_that_is_gone_touched_again_and_again_counts_once():
     del grid
     again = a_grid()
     assert again.index is index and live.leaves[index] == max(before, counted)
+    assert all(other.index is not index for other in others)
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ SAME_NORMAL = 1e-6  # whole numbers are summed; what is left is the division
 
 def random_surface(span: int = 20) -> SurfaceMap:
     """Latents, support and votes at random, over several blocks on either side of the origin."""
-    target = SurfaceMap(encoder=EncoderSettings(rank=6, anchors=64))
+    target = SurfaceMap(encoder=EncoderSettings(rank=6, anchors=64), two_sides=False)
     rng = np.random.default_rng(5)
     keys = np.unique(rng.integers(-span, span, (3000, 3)), axis=0).astype(np.int32)
     fields = {
