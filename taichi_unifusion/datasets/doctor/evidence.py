@@ -8,7 +8,7 @@ differences, pair by pair.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -51,11 +51,11 @@ class Evidence:
 
     def __init__(self, sample: Sample, near: PosePairs, left_out: list[int]) -> None:
         self.sample, self.near = sample, near
-        self.wide = _chosen(sample, _wide_pairs(sample, left_out))[0]
+        self.wide = sample.chosen(_wide_pairs(sample, left_out), MOST_WIDE)[0]
         self.moments, self.at = self.wide, None
         if sample.timed:
             # under another clock the camera may move where it seems to rest
-            self.moments, used = _chosen(sample, _pairs_in_time(sample, left_out))
+            self.moments, used = sample.chosen(_pairs_in_time(sample, left_out), MOST_WIDE)
             self.at = sample.times[[sample.places[i] for i in used]]
         self.scored: dict[tuple[Change, bool], NDArray[np.float64]] = {}
         self.poses_at: dict[float, NDArray[np.float64]] = {}
@@ -180,31 +180,21 @@ Pairs = list[tuple[int, int]]  # of places in a sample
 
 def _wide_pairs(sample: Sample, left_out: list[int]) -> Pairs:
     """Frames that lie some steps apart."""
-    pairs = []
-    for chain in sample.chains(MIN_MOTION):
-        kept = [i for i in chain if i not in left_out]
-        reaches = REACHES if len(kept) > SHORT else (1, *REACHES)
-        pairs += [(a, b) for reach in reaches for a, b in zip(kept, kept[reach:], strict=False)]
-    return pairs
+    return _apart(sample.chains(MIN_MOTION), left_out)
 
 
 def _pairs_in_time(sample: Sample, left_out: list[int]) -> Pairs:
     """Frames that lie some frames of the sample apart, however they moved."""
-    pairs = []
-    for group in sample.groups:
-        posed = [i for i in group if sample.frames[i].T_world_camera is not None]
-        kept = [i for i in posed if i not in left_out]
+    posed = {i for i, frame in enumerate(sample.frames) if frame.T_world_camera is not None}
+    return _apart([[i for i in group if i in posed] for group in sample.groups], left_out)
+
+
+def _apart(groups: Sequence[Sequence[int]], left_out: list[int]) -> Pairs:
+    """Pairs, in order, of frames that lie some places apart in a group."""
+    pairs = set()
+    for group in groups:
+        kept = [i for i in group if i not in left_out]
         reaches = REACHES if len(kept) > SHORT else (1, *REACHES)
-        pairs += [(a, b) for reach in reaches for a, b in zip(kept, kept[reach:], strict=False)]
-    return pairs
-
-
-def _chosen(sample: Sample, pairs: Pairs) -> tuple[PosePairs, list[int]]:
-    """Some of the pairs, evenly chosen, and their frames' places in the sample."""
-    pairs = sorted(set(pairs))
-    kept = np.linspace(0, len(pairs) - 1, min(MOST_WIDE, len(pairs))).round().astype(int)
-    pairs = [pairs[i] for i in kept]
-    used = sorted({i for pair in pairs for i in pair})
-    place = {i: k for k, i in enumerate(used)}
-    found = PosePairs([sample.frames[i] for i in used], [(place[a], place[b]) for a, b in pairs])
-    return found, used
+        for reach in reaches:
+            pairs |= set(zip(kept, kept[reach:], strict=False))
+    return sorted(pairs)

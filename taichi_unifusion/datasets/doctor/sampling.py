@@ -92,12 +92,16 @@ class Sample:
                 break
         if not pairs:
             return None
-        kept = np.linspace(0, len(pairs) - 1, min(MOST_PAIRS, len(pairs))).round().astype(int)
-        chosen = [pairs[i] for i in kept]
-        used = sorted({i for pair in chosen for i in pair})
+        return self.chosen(pairs, MOST_PAIRS)
+
+    def chosen(self, pairs: Sequence[tuple[int, int]], most: int) -> tuple[PosePairs, list[int]]:
+        """At most so many of the pairs, evenly chosen, and their frames' places in the sample."""
+        kept = np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().astype(int)
+        pairs = [pairs[i] for i in kept]
+        used = sorted({i for pair in pairs for i in pair})
         place = {i: k for k, i in enumerate(used)}
-        pairs = PosePairs([self.frames[i] for i in used], [(place[a], place[b]) for a, b in chosen])
-        return pairs, used
+        found = [(place[a], place[b]) for a, b in pairs]
+        return PosePairs([self.frames[i] for i in used], found), used
 
 
 def take_sample(recording: Dataset) -> Sample:
