@@ -99,7 +99,8 @@ def test_two_results_become_one_in_the_world_of_the_first(
     monday, tuesday, of_both, tmp_path, capsys
 ):
     out = tmp_path / "merged"
-    assert main(["merge", str(monday), str(tuesday), "--align", "--out", str(out)]) == 0
+    words = ["merge", str(monday), str(tuesday), "--align", "--resolution", "2", "--out", str(out)]
+    assert main(words) == 0
     assert "views were recognised" in capsys.readouterr().out
     assert_same_surface(out, of_both)
     record = json.loads((out / "metrics.json").read_text())
