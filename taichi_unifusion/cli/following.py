@@ -16,7 +16,7 @@ from ..types import Trajectory
 from .color_camera import AUTO
 from .into import Addition, remembered
 from .options import OutputOptions, RunOptions
-from .terminal import frame_progress
+from .viewing import map_frames
 
 if TYPE_CHECKING:
     from ..maps.window_store import WindowStore
@@ -145,15 +145,8 @@ def map_in_one_pass(
     frames = OnlineFrames(recording, tracker, options.recording.every, following(pipeline))
     logger.info("tracking: %s, in one pass with mapping", poses.tracking)
     warnings = say_warnings(frames.frames, tracker)
-    with frame_progress(len(frames)) as on_frame:
-        run = pipeline.run(
-            frames,
-            strict=options.recording.strict,
-            stop=stop,
-            on_frame=on_frame,
-            on_step=watcher.on_step,
-            on_skip=watcher.on_skip,
-        )
+    strict = options.recording.strict
+    run = map_frames(pipeline, frames, len(frames), strict=strict, stop=stop, watcher=watcher)
     result = concluded(tracker, time.perf_counter() - started, warnings, run.interrupted)
     run = replace(
         run, skipped=tuple(replace(each, index=frames.place_of(each.index)) for each in run.skipped)

@@ -29,8 +29,8 @@ from .options import (
     source_of,
 )
 from .replacing import say_what_is_replaced
-from .terminal import frame_progress, report
-from .viewing import WatchOptions, run_watched
+from .terminal import report
+from .viewing import WatchOptions, map_frames, run_watched
 
 if TYPE_CHECKING:
     from ..results import RunFolder
@@ -145,17 +145,14 @@ def _map(
     pipeline = Pipeline(settings, keep=store)
     tracker = make_tracker(source.tracking, settings.tracking, settings.preprocess)
     logger.info("live: %s, tracking: %s; Ctrl-C ends it", source.name, source.tracking)
-    with (
-        LiveFrames(source.frames, source.name, stop=stop, most=source.most) as frames,
-        frame_progress(source.most or 0) as on_frame,
-    ):
-        run = pipeline.run(
+    with LiveFrames(source.frames, source.name, stop=stop, most=source.most) as frames:
+        run = map_frames(
+            pipeline,
             TrackedFrames(frames, tracker, following(pipeline)),
+            source.most or 0,
             strict=strict,
             stop=stop,
-            on_frame=on_frame,
-            on_step=watcher.on_step,
-            on_skip=watcher.on_skip,
+            watcher=watcher,
         )
     said = (
         f"{frames.received} frames came, {len(run.steps)} are mapped, {frames.dropped} were dropped"

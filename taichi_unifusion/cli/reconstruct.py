@@ -43,7 +43,7 @@ from .options import (
 from .replacing import say_what_is_replaced
 from .resuming import end_saving, is_complete, make_pipeline, open_saver, registered
 from .terminal import DONE, FAILED, frame_progress, report
-from .viewing import WatchOptions, run_watched
+from .viewing import WatchOptions, map_frames, run_watched
 
 if TYPE_CHECKING:
     from ..language import EncoderChoice
@@ -271,17 +271,16 @@ def _map(
         pipeline = Pipeline(options.settings, encoder=encoder, keep=store, maps=maps)
     else:
         pipeline = make_pipeline(options, encoder, folder, saver)
-    with frame_progress(len(frames)) as on_frame:
-        run = pipeline.run(
-            frames,
-            strict=options.recording.strict,
-            stop=stop,
-            on_frame=on_frame,
-            on_step=watcher.on_step,
-            on_skip=watcher.on_skip,
-            on_border=saver.at_border if store is None and not added else None,
-            before=saver.resumed and saver.resumed.so_far,
-        )
+    run = map_frames(
+        pipeline,
+        frames,
+        len(frames),
+        strict=options.recording.strict,
+        stop=stop,
+        watcher=watcher,
+        on_border=saver.at_border if store is None and not added else None,
+        before=saver.resumed and saver.resumed.so_far,
+    )
     kept = remembered(folder, frames, run, store, added, pipeline.config, stop)
     return Mapped(pipeline, run, None, (*keep_store(folder, store), *kept))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,9 +13,13 @@ from ..errors import InputError
 from .interrupts import INTERRUPTED, stop_on_signal
 from .options import EncoderOptions
 from .results_source import results_source
+from .terminal import frame_progress
 
 if TYPE_CHECKING:
+    from ..pipeline import OnBorder, Pipeline
     from ..results import RunFolder
+    from ..run_log import RunResult, RunSoFar
+    from ..types import Frame
     from ..viewer.null import Watcher
     from ..viewer.source import ResultsSource
     from ..viewer.web import WebViewer
@@ -78,6 +82,33 @@ def open_watcher(
         return results_source(path, SceneOptions(), EncoderOptions())
 
     return WebLive(viewer, frames, stop, open_results)
+
+
+def map_frames(
+    pipeline: Pipeline,
+    frames: Sequence[Frame],
+    expected: int,
+    *,
+    strict: bool,
+    stop: Callable[[], bool],
+    watcher: Watcher,
+    on_border: OnBorder | None = None,
+    before: RunSoFar | None = None,
+) -> RunResult:
+    """Run frames through a pipeline, with a bar for so many that are expected (0: nobody knows), and
+    with what watches them; `on_border` and `before` are those of `Pipeline.run`.
+    """
+    with frame_progress(expected) as on_frame:
+        return pipeline.run(
+            frames,
+            strict=strict,
+            stop=stop,
+            on_frame=on_frame,
+            on_step=watcher.on_step,
+            on_skip=watcher.on_skip,
+            on_border=on_border,
+            before=before,
+        )
 
 
 def run_watched(

@@ -10,9 +10,9 @@ import taichi as ti
 
 from .arrays import Bytes1, Doubles2, Floats1, Floats2, Floats3, Ints1, Masks2, Rows2
 from .cells import BLOCK_CELLS
+from .fusion import LEAST_WEIGHT
 
 OPPOSITE = -0.5  # cosine between slopes that face away from each other
-LEAST_WEIGHT = 0.5  # as of `fusion`: less is rounding
 STEEP = 0.3  # mean slope of a field that has a surface: 1 is a distance
 
 
