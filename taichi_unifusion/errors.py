@@ -65,6 +65,17 @@ class PoseError(FrameError):
     """A pose is missing, not finite or not a rigid transform."""
 
 
+class NotRigid(PoseError):
+    """A pose is finite but no rigid transform: whose it is, why, and T (4, 4) as it was found."""
+
+    def __init__(self, name: str, why: str, T: Any) -> None:
+        super().__init__(name, why, T)
+        self.name, self.T = name, T
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.args[1]}"
+
+
 class NoOverlap(DatasetError):
     """Two recordings do not see the same place, or not surely."""
 

@@ -57,7 +57,7 @@ NO_MEMORY = [
 
 
 @pytest.mark.parametrize("error", [zlib.error("bad stream"), *NO_MEMORY], ids=repr)
-def test_R2_an_error_that_is_not_ours_ends_the_run_and_keeps_the_frames_before(
+def test_c5_R2_an_error_that_is_not_ours_ends_the_run_and_keeps_the_frames_before(
     error, frames, of_two, monkeypatch
 ):
     fail_at(monkeypatch, error, 3)

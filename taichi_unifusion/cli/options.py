@@ -106,6 +106,8 @@ class RecordingOptions:
         float | None, arg(metavar="METRES", help_behavior_hint="(default: 1)")
     ] = None
     """Metres in a unit of the poses' translations: 0.01 where they are centimetres."""
+    project_poses: FlagCreatePairsOff[bool] = False
+    """Take the nearest rotation where a pose's is none (scaled, sheared), instead of skipping its frame."""
     clock_offset: Annotated[
         float | None, arg(metavar="SECONDS", help_behavior_hint="(default: 0)")
     ] = None
@@ -280,6 +282,7 @@ def reading_options(options: RecordingOptions) -> dict[str, Any]:
         "intrinsics": options.intrinsics,
         "pose_reading": options.pose_reading,
         "pose_scale": options.pose_scale,
+        "project_poses": options.project_poses or None,
         "clock_offset": options.clock_offset,
     }
     given = {name: value for name, value in flags.items() if value is not None}

@@ -144,11 +144,15 @@ def open_dataset(format: str, path: str | Path | None = None, **options: Any) ->
         return _open(format, opener, path, options)
     from .depth_camera import Intrinsics
     from .mended import Mended
+    from .projected import Projected
 
     if mending.intrinsics is not None and format in TAKES_INTRINSICS:
         options["camera"] = Intrinsics(*mending.intrinsics)
         mending = replace(mending, intrinsics=None)
     recording = _open(format, opener, path, options)
+    if mending.project_poses is not None:
+        recording = Projected(recording) if mending.project_poses else recording
+        mending = replace(mending, project_poses=None)
     return Mended(recording, mending) if mending.changes else recording
 
 

@@ -26,6 +26,10 @@ class Mending:
         None, "How poses are written, as w2c, opengl or w-first+w2c; a wrong one lists the words."
     )
     pose_scale: float | None = _says(None, "Metres in a unit of the poses' translations.")
+    project_poses: bool | None = _says(
+        None,
+        "Take the nearest rotation where a pose's is none (scaled, sheared), instead of refusing it.",
+    )
     clock_offset: float | None = _says(
         None, "Seconds to add to a frame's time stamp before its pose is looked up."
     )

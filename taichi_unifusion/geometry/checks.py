@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..errors import InputError, PoseError, UniFusionError, shortened
+from ..errors import InputError, NotRigid, PoseError, UniFusionError, shortened
 
 # |R^T R - I| and |det R - 1|: text files of 6 digits pass, a scale of 0.1 % does not
 RIGID_TOLERANCE = 1e-3
+FLATTEST = 1e-6  # least stretch of a matrix over its largest, below which it is flat
 
 
 def as_numbers(
@@ -48,8 +49,25 @@ def check_rigid(T: ArrayLike, name: str = "T_world_camera") -> NDArray[np.float6
     R = T[:3, :3]
     det, skew = float(np.linalg.det(R)), float(np.abs(R.T @ R - np.eye(3)).max())
     if abs(det - 1) > RIGID_TOLERANCE or skew > RIGID_TOLERANCE:
-        raise PoseError(
-            f"{name}: not a rotation (det R = {det:.4f}, max |R^T R - I| = {skew:.4f}; "
-            f"both must be within {RIGID_TOLERANCE} of 1 and 0)"
+        raise NotRigid(
+            name,
+            f"not a rotation (det R = {det:.4f}, max |R^T R - I| = {skew:.4f}; "
+            f"both must be within {RIGID_TOLERANCE} of 1 and 0)",
+            T,
         )
     return T
+
+
+def nearest_rigid(T: NDArray[np.float64], name: str = "T_world_camera") -> NDArray[np.float64]:
+    """T (4, 4) with the rotation nearest to its own (least sum of squared differences).
+
+    Raises PoseError where it mirrors or flattens space: no rotation is nearest then.
+    """
+    U, stretch, Vt = np.linalg.svd(T[:3, :3])
+    if np.linalg.det(T[:3, :3]) <= 0 or stretch[-1] < FLATTEST * stretch[0]:
+        raise PoseError(
+            f"{name}: det R = {np.linalg.det(T[:3, :3]):.4f}; a mirrored or flat matrix has no nearest rotation"
+        )
+    rigid = np.array(T, np.float64)
+    rigid[:3, :3] = U @ Vt
+    return rigid

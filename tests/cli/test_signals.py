@@ -78,12 +78,12 @@ def signalled(moment: str, number: signal.Signals, *arguments: str) -> tuple[int
 @pytest.mark.parametrize(
     ("moment", "code"), [(IMPORTING, 130), (AT_THE_END, 0)], ids=["imports", "end"]
 )
-def test_R3_R4_signals_at_the_edges_are_no_traceback(number, moment, code):
+def test_c16_R3_R4_signals_at_the_edges_are_no_traceback(number, moment, code):
     ended, said = signalled(moment, number, "--version")
     assert ended == code and said == ("unifusion: error: stopped\n" if code else "")
 
 
-def test_R4_a_signal_while_mesh_writes_leaves_no_temporary_file(made, tmp_path):
+def test_c16_R4_a_signal_while_mesh_writes_leaves_no_temporary_file(made, tmp_path):
     out = shutil.copytree(made, tmp_path / "out")
     before = sorted(path.name for path in out.iterdir())
     code, said = signalled(WRITING, signal.SIGTERM, "mesh", str(out), "--device", DEVICE)

@@ -29,6 +29,7 @@ from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.errors import DatasetError, FrameError, InputError, PoseError
 
 EXACT = 1e-12  # double arithmetic on numbers near one
+TEXT = 1e-6  # poses as text have that many digits
 
 
 SHEAR = np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -73,6 +74,29 @@ def test_P2_what_is_no_rotation_is_refused_with_numbers(scene, T, said):
     with pytest.raises(PoseError, match="not a rotation") as caught:
         open_dataset("7scenes", scene)[1]
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("stretch", [np.diag([1.3, 1.3, 1.3, 1]), SHEAR @ SHEAR.T, np.eye(4)])
+def test_P2_poses_become_the_nearest_rotation_where_that_is_asked_for(scene, stretch):
+    """A rotation times a positive definite matrix is its polar decomposition: the nearest rotation."""
+    T = make_pose(1)
+    (scene / "frame-000001.pose.txt").write_text(matrix_text(T @ stretch))
+    dataset = open_dataset("7scenes", scene, project_poses=True)
+    np.testing.assert_allclose(dataset[1].T_world_camera, T, atol=TEXT)
+    np.testing.assert_allclose(dataset.pose_at(1)[1], T, atol=TEXT)
+    plain = open_dataset("7scenes", scene)
+    np.testing.assert_array_equal(dataset[0].T_world_camera, plain[0].T_world_camera)
+    np.testing.assert_array_equal(dataset[1].color, plain.without_poses()[1].color)
+    # what else is asked for is done to the nearest rotation
+    half = open_dataset("7scenes", scene, project_poses=True, pose_scale=0.5)
+    np.testing.assert_allclose(half[1].T_world_camera[:3, 3], T[:3, 3] / 2, atol=TEXT)
+
+
+@pytest.mark.parametrize("R", [np.diag([1.0, 1, -1, 1]), np.diag([1.0, 1, 0, 1])])
+def test_P2_what_mirrors_or_flattens_has_no_nearest_rotation(scene, R):
+    (scene / "frame-000001.pose.txt").write_text(matrix_text(make_pose(1) @ R))
+    with pytest.raises(PoseError, match="frame-000001.pose.txt.*no nearest rotation"):
+        open_dataset("7scenes", scene, project_poses=True)[1]
 
 
 @pytest.mark.parametrize("write", [write_scannet, write_sens])

@@ -143,7 +143,7 @@ def test_c8_what_is_wrong_with_archives_is_said(tmp_path):
         read_archive(tmp_path / "e.npz", ["a"])
 
 
-def test_c8_a_damaged_stream_in_the_middle(tmp_path):
+def test_c5_c8_a_damaged_stream_in_the_middle(tmp_path):
     path = tmp_path / "3.npz"
     np.savez_compressed(path, np.round(RNG.normal(size=(12, 16, 16)), 1).astype(np.float32))
     data = bytearray(path.read_bytes())

@@ -178,7 +178,7 @@ def test_an_index_that_would_pass_safe_memory_is_refused(monkeypatch):
 
 
 @pytest.mark.skipif(DEVICE != "cpu", reason="the CPU's pool; that of a GPU has a test of its own")
-def test_the_indices_of_all_maps_count_together(monkeypatch):
+def test_c1_the_indices_of_all_maps_count_together(monkeypatch):
     """Each map alone is within its limit; what is touched again and again counts once."""
     gc.collect()
     grids, rng = [a_grid() for _ in range(3)], np.random.default_rng(8)

@@ -48,7 +48,7 @@ def files_in(folder: RunFolder) -> list[str]:
     return sorted(folder.relative(path) for path in found)
 
 
-def test_a_run_owns_what_its_record_lists(folder):
+def test_c6_a_run_owns_what_its_record_lists(folder):
     assert owned_files(folder) == set(files_in(folder))
     assert describe_earlier(folder) == "an earlier run (maps color, surface; a mesh)"
     (folder.path / "photo.png").touch()
@@ -120,7 +120,7 @@ def test_R7_a_mark_says_that_a_run_was_ended_and_keeps_what_is_whose(folder):
     assert "ended before it was done" in str(problem)
 
 
-def test_R7_a_run_that_dies_while_it_writes_is_seen_and_the_next_one_cleans_up(
+def test_c10_R7_a_run_that_dies_while_it_writes_is_seen_and_the_next_one_cleans_up(
     frames, folder, monkeypatch, capsys, tmp_path
 ):
     """As kill -9 leaves it: new maps beside an old mesh, and no word of the old run."""
@@ -149,7 +149,7 @@ def test_R7_a_run_that_dies_while_it_writes_is_seen_and_the_next_one_cleans_up(
     assert read_record(folder.record).frames.used == 1
 
 
-def test_R7_info_compares_sizes_with_the_record(folder, capsys):
+def test_c10_R7_info_compares_sizes_with_the_record(folder, capsys):
     assert inspect(folder.path).problems == ()
     folder.mesh_file("glb").unlink()  # to save room
     assert inspect(folder.path).problems == ()
@@ -176,7 +176,7 @@ def test_R5_files_of_an_earlier_run_that_could_not_be_replaced_stay_owned(
     assert "mesh.glb, mesh.ply are of an earlier run" in str(problem)
 
 
-def test_an_older_run_is_not_emptied_and_a_file_of_others_is_not_replaced_in_silence(
+def test_c6_an_older_run_is_not_emptied_and_a_file_of_others_is_not_replaced_in_silence(
     frames, tmp_path, capsys, monkeypatch
 ):
     recording, out = write_folder(tmp_path / "recording", frames), tmp_path / "out"
@@ -200,14 +200,14 @@ def test_an_older_run_is_not_emptied_and_a_file_of_others_is_not_replaced_in_sil
     assert {path.name for path in tmp_path.iterdir()} == {"recording", "out"}
 
 
-def test_properties_cannot_take_the_names_of_other_files():
+def test_c7_properties_cannot_take_the_names_of_other_files():
     for name in ("segmentation", "query-x", "part-1", "mesh", "preview"):
         with pytest.raises(InputError, match="is none of surface"):
             SurfaceProperty(name, 1, lambda frame: frame.depth)
     assert SurfaceProperty("queries", 1, lambda frame: frame.depth).name == "queries"
 
 
-def test_links_stay_links_but_not_those_of_other_users(folder, frames, tmp_path):
+def test_c13_links_stay_links_but_not_those_of_other_users(folder, frames, tmp_path):
     if os.geteuid() != 0:
         pytest.skip("only root can make a link of another user")
     victim = tmp_path / "victim"

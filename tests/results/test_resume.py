@@ -265,7 +265,7 @@ def command(place: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_R7_kill_9_of_the_command_and_resume(tmp_path, capsys):
+def test_c10_R7_kill_9_of_the_command_and_resume(tmp_path, capsys):
     recording = write_folder(tmp_path / "recording", make_frames(12))
     arguments = ["reconstruct", "folder", str(recording), *FLAGS, *WINDOW]
     out, undisturbed = RunFolder(tmp_path / "out"), RunFolder(tmp_path / "undisturbed")

@@ -79,27 +79,32 @@ IDS = {
     "N6": "bounds and overflow in kernels",
     "K1": "what an installation needs",
     "K2": "what an import takes",
+    "c1": "several large maps in one process",
     "c2": "tensors that do not belong into a map",
     "c3": "manifests that lie about sizes",
     "c4": "settings of wrong types in map files",
+    "c5": "errors that are not ours in the middle of a run",
+    "c6": "files in a results folder that are not the run's",
+    "c7": "properties that are called like other files",
     "c8": "arrays and JSON that lie or are cut",
     "c9": "threads, forks, copies, another ti.init",
+    "c10": "runs that are killed while they write",
     "c11": "settings that cannot be",
     "c12": "control characters in names",
+    "c13": "links in a results folder",
     "c14": "images larger than the camera's",
     "c15": "zero bytes in names, mixed polygons",
+    "c16": "signals at the edges of a command",
     "c17": "values of any size, normals of any length",
     "c18": "order of frames and the cut of the surface",
     "c19": "debug mode",
 }
 # id -> why there is no test of that name
 OPEN = {
-    "c1": "several large maps in a process: tested with R1 in tests/kernels/test_index.py",
     "R8": "`make soak`, too long for the suite",
     "V2": "the viewer takes no uploads",
     "N1": "counts of vertices are bounded by c18, not frozen",
     "N2": "every kernel has its twin in tests/support/reference*.py",
-    "P2 by option": "poses are not projected to the nearest rotation: they are refused with their numbers",
     "K3": "`python scripts/extras.py` installs every extra by itself; figures above",
     "K4": "py.typed is tested in test_packaging.py; types are checked by `make types`",
 }
@@ -114,7 +119,7 @@ def tests_by_id() -> dict[str, list[str]]:
         for test in NAME.findall(file.read_text()):
             for word in WORDS.findall(test.removeprefix("test_").replace("_", " ")):
                 key = word if word in found else word.upper()
-                if key in found and not (word.islower() and key == "C1"):
+                if key in found:
                     found[key].append(f"{file.relative_to(ROOT / 'tests')}: {test}")
     return found
 
