@@ -77,8 +77,8 @@ def building_frames(options: argparse.Namespace) -> Iterator[tuple[int, Frame]]:
                 with np.load(file) as values:
                     T = values["T"].copy()
                     T[:2, 3] += PITCH * (column - center[0], row - center[1])
-                    fx, fy, cx, cy, width, height = values["camera"].tolist()
-                    camera = PinholeCamera(fx, fy, cx, cy, int(width), int(height))
+                    width, height, *rest = values["camera"].tolist()
+                    camera = PinholeCamera(int(width), int(height), *rest)
                     yield n, Frame(values["depth"], camera, values["color"], T, n * len(files) + i)
 
 

@@ -40,13 +40,15 @@ class Job:
     folder: str  # where shards lie; all processes can read and write there
     encoder: EncoderChoice | None = None  # of image-text features, if they are mapped
 
-    def frames(self, first: int, last: int) -> Dataset:
-        """The frames of the run from one place to another; raises DatasetError."""
+    def frames(self, first: int, last: int, *, color: bool = True) -> Dataset:
+        """The frames of the run from one place to another, with their colour or perhaps without; raises
+        DatasetError.
+        """
         from ..tracking.sequence import PosedFrames
 
         source = self.source
         recording = open_dataset(source.format, source.path or None, **source.reading)
-        recording = registered_as(recording, source.color)
+        recording = registered_as(recording, source.color) if color else recording.depth_only()
         asked = source.asked[first:last]
         frames = recording[asked.start : asked.stop : asked.step]
         if self.tracked is None:

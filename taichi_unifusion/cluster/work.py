@@ -95,7 +95,7 @@ def vote(job: Job, shard: Shard, merged: str) -> int:
     used = {step.index for step in done.run.steps}
     limit = parse_bytes(without_votes(job.config).map_memory, "map_memory")
     voters = Voters(TileFolder.open(merged), job.config.preprocess, limit)
-    for load in load_ahead(job.frames(shard.first, shard.last)):
+    for load in load_ahead(job.frames(shard.first, shard.last, color=False)):
         try:
             frame = load()
         except FrameError:  # it was not fused either

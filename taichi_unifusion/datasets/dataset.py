@@ -48,6 +48,10 @@ class Dataset(ABC, Sequence[Frame]):
         """A view without poses, so that frames with broken poses still load. Default: unchanged."""
         return self
 
+    def depth_only(self) -> Dataset:
+        """A view for who needs no colour, so that it need not be read. Default: unchanged."""
+        return self
+
     def pose_at(self, index: int) -> tuple[float | None, NDArray[np.float64] | None]:
         """When frame `index` was taken [s] and its pose, without its images where these need not be
         read; None for what is not known.

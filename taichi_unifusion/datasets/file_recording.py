@@ -100,6 +100,12 @@ class Recording(CameraPair):
         )
         return bare
 
+    def depth_only(self) -> Recording:
+        """The same frames without their colour and infrared."""
+        bare = copy(self)
+        bare.frames = tuple(replace(each, color=None, infrared=None) for each in self.frames)
+        return bare
+
     def pose_at(self, index: int) -> tuple[float | None, NDArray[np.float64] | None]:
         files = self.frames[index]
         time = files.timestamp

@@ -101,6 +101,21 @@ def test_slices_are_views_of_the_same_frames(recording):
         dataset[len(dataset)]
 
 
+def test_depth_alone_is_the_same_depth(recording):
+    dataset, *_ = recording
+    for i, bare in enumerate(dataset.depth_only()):
+        np.testing.assert_array_equal(bare.depth, dataset[i].depth)
+        np.testing.assert_array_equal(bare.T_world_camera, dataset[i].T_world_camera)
+        assert (bare.index, bare.timestamp) == (dataset[i].index, dataset[i].timestamp)
+
+
+def test_depth_alone_does_not_read_colour(tmp_path):
+    write_seven_scenes(tmp_path, make_samples(1))
+    (tmp_path / "frame-000000.color.png").write_bytes(b"no image")
+    bare = open_dataset("7scenes", tmp_path).depth_only()[0]
+    assert bare.color is None and bare.depth.any()
+
+
 def test_common_options_reach_every_format(recording, tmp_path, request):
     _, samples, scale, _ = recording
     name, _, options, _, _ = ROUND_TRIPS[request.node.callspec.params["recording"]]
