@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,8 +72,19 @@ class Engine:
         stop: Callable[[], bool] = lambda: False,
     ) -> list[T | UniFusionError | None]:
         """The result of `work` for each of the arguments, or the error that it ended with; None for
-        what was not done because `stop` said so. Work of a worker that is lost is done again.
+        what was not done because `stop` said so. Work of a worker that is lost is done again; raises
+        UniFusionError where the scheduler is lost.
         """
+        with _connected():
+            return self._map(work, arguments, on_done, stop)
+
+    def _map(
+        self,
+        work: Callable[..., T],
+        arguments: Sequence[tuple],
+        on_done: Callable[[], None],
+        stop: Callable[[], bool],
+    ) -> list[T | UniFusionError | None]:
         from distributed import client as dask_client
 
         wait: Any = dask_client.wait
@@ -90,6 +102,19 @@ class Engine:
                 on_done()
         self._client.cancel(list(pending))
         return [None if each in pending else _result(each) for each in futures]
+
+
+@contextmanager
+def _connected() -> Iterator[None]:
+    """Say in a sentence that the connection to the scheduler is gone, which Dask says in several ways."""
+    from distributed.comm.core import CommClosedError
+
+    try:
+        yield
+    except (CancelledError, CommClosedError):
+        raise UniFusionError(
+            "the scheduler that hands out the work is gone, or no longer reached: start it again"
+        ) from None
 
 
 def _result(future: Any) -> Any:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from taichi_unifusion.cluster.engine import ClusterSettings, open_engine
-from taichi_unifusion.errors import FileError, InputError
+from taichi_unifusion.errors import FileError, InputError, UniFusionError
 
 pytest.importorskip("distributed", reason="needs Dask: pip install 'taichi-unifusion[cluster]'")
 
@@ -40,6 +44,40 @@ def test_nobody_answers_at_the_address(monkeypatch):
     cluster = ClusterSettings(cluster="tcp://127.0.0.1:1")
     with pytest.raises(InputError, match="no scheduler answers"), open_engine(cluster):
         pass
+
+
+def test_the_scheduler_is_lost(tmp_path):
+    """Nobody waits forever, and it is said."""
+    file = tmp_path / "scheduler.json"
+    command = ["dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    scheduler = subprocess.Popen(
+        [sys.executable, "-m", *command, "--scheduler-file", str(file)],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        wait_for(lambda: file.exists() and file.read_text().strip().endswith("}"))
+        address = json.loads(file.read_text())["address"]
+
+        def stop() -> bool:  # asked while work waits for workers that never come
+            scheduler.kill()
+            return False
+
+        with (
+            open_engine(ClusterSettings(cluster=address)) as engine,
+            pytest.raises(UniFusionError, match="scheduler .* is gone"),
+        ):
+            engine.map(double, [(1, str(tmp_path))], stop=stop)
+    finally:
+        scheduler.kill()
+        scheduler.wait()
+
+
+def wait_for(there, seconds: float = 60) -> None:
+    """Until `there` says so."""
+    deadline = time.monotonic() + seconds
+    while not there():
+        assert time.monotonic() < deadline, "the scheduler did not start"
+        time.sleep(0.1)
 
 
 def test_workers_are_counted_and_one_place_is_named():
