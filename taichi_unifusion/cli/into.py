@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,14 +13,16 @@ import numpy as np
 from ..config import Config, load_config
 from ..datasets import Dataset
 from ..datasets.loading import index_in_recording
-from ..errors import FileError, InputError
+from ..errors import FileError, InputError, NoOverlap
 from .options import RunOptions
 
 if TYPE_CHECKING:
     from ..maps import BaseMap
     from ..maps.window_store import WindowStore
     from ..results import RunFolder
+    from ..results.placement import Placement
     from ..results.record import Source
+    from ..results.saver import RunSaver
     from ..run_log import RunResult
     from ..tracking.joining import Joined
     from ..tracking.keyframes import Keyframes
@@ -36,7 +38,7 @@ class Addition:
 
     frames: PosedFrames
     keyframes: Keyframes  # of the map, and of the recording
-    details: dict[str, Any]  # for the record
+    details: Mapping[str, Any]  # for the record
     sources: tuple[Source, ...]  # what the map was made from, in order
     windows: Path | None  # what its windows were fused from, if that was kept
 
@@ -50,14 +52,17 @@ def check_into(options: RunOptions, on_workers: bool) -> None:
     output, into = options.output, options.output.into
     if into is None:
         return
-    if output.resume or on_workers:
-        other = "--resume" if output.resume else "several workers"
-        raise InputError(f"--into: does not go with {other} yet; leave it out")
-    known = RunFolder(into)
-    before = read_run(into).config()
-    if before.map_memory or options.settings.map_memory:
+    if on_workers:
         raise InputError(
-            f"--into: {into} holds maps in tiles (map_memory), which cannot be added to yet"
+            "--into: one process adds a recording to a map; leave --workers and --cluster out"
+        )
+    known, goes_on = RunFolder(into), output.resume and RunFolder(output.out).placement.exists()
+    before = settings_of(into) if goes_on else read_run(into).config()
+    _check_tiles(known, options)
+    if output.resume and known.windows.exists() and not (output.forget or _tiled(options)):
+        raise InputError(
+            f"--resume: a run that keeps windows, as those of {known.windows}, cannot go on yet; leave --resume "
+            "out, or let go of them with --forget"
         )
     for name in SETTINGS:
         if getattr(options.settings, name) != getattr(before, name):
@@ -68,6 +73,26 @@ def check_into(options: RunOptions, on_workers: bool) -> None:
         raise InputError(
             f"--keep-windows: {into} holds no {known.windows.name}, so that of both would lack what it was made "
             "from; leave it out"
+        )
+
+
+def _tiled(options: RunOptions) -> bool:
+    return bool(options.settings.map_memory)
+
+
+def _check_tiles(known: RunFolder, options: RunOptions) -> None:
+    """Raise InputError where a map in tiles is to be kept in memory as a whole; say what else changes."""
+    from ..files.tiles import TileFolder
+
+    if _tiled(options):
+        if known.windows.exists():
+            logger.warning(
+                "%s is not gone on with: maps in tiles cannot follow a trajectory that changes",
+                known.windows.name,
+            )
+    elif any(map(TileFolder.is_one, known.maps.values())):
+        raise InputError(
+            f"--into: the maps of {known.path} lie in tiles: keep them so with --map-memory 2GB, or another limit"
         )
 
 
@@ -83,16 +108,26 @@ def settings_of(into: str | Path) -> Config:
     return load_config(file)
 
 
-def maps_of(options: RunOptions) -> dict[str, BaseMap]:
-    """The maps that a recording is added to; none without --into. Starts Taichi."""
+def maps_of(options: RunOptions, folder: RunFolder) -> dict[str, BaseMap] | None:
+    """The maps that a recording is added to, which are read; those in tiles are laid out in the `folder`
+    of the run instead. None without --into. Starts Taichi; raises FileError where a run was ended while
+    it wrote them.
+    """
     from .. import runtime
+    from ..files.tiles import TileFolder
     from ..maps import load_map
-    from ..results.run_folder import RunFolder
+    from ..results.reader import read_run
 
     if options.output.into is None:
-        return {}
+        return None
     runtime.init(options.settings.device, threads=options.settings.threads or None)
-    return {name: load_map(path) for name, path in RunFolder(options.output.into).maps.items()}
+    found = {}
+    for name, path in read_run(options.output.into).folder.maps.items():
+        if TileFolder.is_one(path):
+            TileFolder.open(path).snapshot(folder.working_tiles / name)
+        else:
+            found[name] = load_map(path)
+    return found
 
 
 def remembered(
@@ -122,12 +157,47 @@ def remembered(
     return (folder.keyframes,)
 
 
-def placed(recording: Dataset, options: RunOptions, stop: Callable[[], bool]) -> Addition:
-    """The recording, which has poses, in the world of the map; raises NoOverlap where its place is
-    not sure.
+def placed(
+    recording: Dataset, options: RunOptions, saver: RunSaver, stop: Callable[[], bool]
+) -> Addition:
+    """The recording, which has poses, in the world of the map, where the run that goes on found it, if
+    one does; raises NoOverlap where its place is not sure, and leaves nothing behind then.
     """
+    from ..results.run_folder import RunFolder
+    from ..results.safe_point import remove_safe_point
+
+    assert options.output.into is not None
+    into = RunFolder(options.output.into)
+    if saver.placed is not None:
+        placement, known = saver.placed
+        logger.info("%s", placement.details["joined"]["said"])
+    else:
+        try:
+            placement, known = _found(recording, options, stop)
+        except NoOverlap:
+            remove_safe_point(saver.folder)
+            raise
+        if not stop():
+            saver.save_placement(placement, known)
+    if into.path.resolve() == saver.folder.path.resolve():
+        saver.save_soon()
+    return Addition(
+        moved(recording, placement),
+        known,
+        placement.details,
+        placement.sources,
+        into.windows if into.windows.exists() else None,
+    )
+
+
+def _found(
+    recording: Dataset, options: RunOptions, stop: Callable[[], bool]
+) -> tuple[Placement, Keyframes]:
+    """The place of the recording, and the keyframes of the map and the recording."""
     from .. import runtime
+    from ..geometry import se3
     from ..results.keyframes import depth_range, known_keyframes
+    from ..results.placement import Placement
     from ..results.reader import read_run
     from ..results.run_folder import RunFolder
     from ..tracking.joining import join, keyframes_of
@@ -145,18 +215,18 @@ def placed(recording: Dataset, options: RunOptions, stop: Callable[[], bool]) ->
         rigid=options.poses.tracking in POSED,
     )
     logger.info("%s", sentence(joined, len(new)))
-    frames = moved(recording, new, joined)
+    motion = joined.T_known_keyframe @ se3.inverse(np.array(new.T_world_keyframe))
     for keyframe, T in zip(new.items, joined.T_known_keyframe, strict=True):
         known.append(keyframe, T)
     folder = RunFolder(options.output.into)
     source = read_run(folder.path).source
-    return Addition(
-        frames,
-        known,
+    placement = Placement(
+        tuple(keyframe.index for keyframe in new.items),
+        motion,
         {"joined": details_of(joined, folder.path, len(new))},
         (*source.before, replace(source, before=())),
-        folder.windows if folder.windows.exists() else None,
     )
+    return placement, known
 
 
 def sentence(joined: Joined, views: int) -> str:
@@ -180,14 +250,12 @@ def details_of(joined: Joined, into: Path, views: int) -> dict[str, Any]:
     }
 
 
-def moved(recording: Dataset, new: Keyframes, joined: Joined) -> PosedFrames:
+def moved(recording: Dataset, placement: Placement) -> PosedFrames:
     """The frames at their new poses: each moves with the keyframe before it."""
     from ..geometry import se3
     from ..tracking.sequence import PosedFrames, with_poses
 
-    before, after = np.array(new.T_world_keyframe), joined.T_known_keyframe
-    motion = after @ se3.inverse(before)
-    starts = np.array([keyframe.index for keyframe in new.items])
+    starts, motion = np.array(placement.places), placement.motion
     poses = {}
     for i in range(len(recording)):
         place, T = index_in_recording(recording, i), recording.pose_at(i)[1]

@@ -218,13 +218,11 @@ def _mapped(
         recording, tracking = _track(recording, options, folder, stop, saver)
     recording, color = registered(recording, color, saver)
     if options.output.into is not None:
-        added = placed(recording, options, stop)
+        added = placed(recording, options, saver, stop)
         recording, tracking = added.frames, {**(tracking or {"mode": "given"}), **added.details}
     if options.poses.tracked:
         assert isinstance(recording, PosedFrames)
         tracked, written = recording.tracking.frames, folder.tracking_files
-        if added:  # else they are there already
-            keep_tracking(folder, recording.tracking)
     frames = recording[::every]
     source = replace(source_of(wanted, len(frames), color), before=added.sources if added else ())
     saver.describe(source, tracking)
@@ -247,6 +245,10 @@ def _mapped(
         )
     else:
         mapped = _map(frames, options, folder, stop, encoder, watcher, saver, added)
+        if added and written:
+            written = written if mapped.run.steps else ()
+            if written:  # now: in the folder of the map itself that ends its record
+                keep_tracking(folder, added.frames.tracking)
     return replace(mapped, tracking=tracking, written=(*written, *mapped.written)), frames, source
 
 
@@ -266,8 +268,8 @@ def _map(
     output, store = options.output, None
     if output.keep_windows or (added and added.windows and not output.forget):
         store = open_store(folder, output, options.settings, moves=False, added=added)
-    if store is not None or added:
-        maps = maps_of(options)
+    if store is not None:
+        maps = maps_of(options, folder)
         pipeline = Pipeline(options.settings, encoder=encoder, keep=store, maps=maps)
     else:
         pipeline = make_pipeline(options, encoder, folder, saver)
@@ -278,7 +280,7 @@ def _map(
         strict=options.recording.strict,
         stop=stop,
         watcher=watcher,
-        on_border=saver.at_border if store is None and not added else None,
+        on_border=saver.at_border if store is None else None,
         before=saver.resumed and saver.resumed.so_far,
     )
     kept = remembered(folder, frames, run, store, added, pipeline.config, stop)
@@ -344,6 +346,6 @@ def _track(
         )
     if options.output.into is None:
         keep_tracking(folder, posed.tracking)
-        if not posed.tracking.interrupted:
-            saver.save_tracking(posed.tracking)
+    if not posed.tracking.interrupted:
+        saver.save_tracking(posed.tracking)
     return posed, {"mode": poses.tracking, **posed.tracking.details}

@@ -13,6 +13,7 @@ from ..errors import FileError, InputError
 from ..results.record import ColorRecord, read_record
 from ..results.run_folder import RunFolder
 from .color_camera import found_color
+from .into import maps_of
 from .options import RunOptions, source_of
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def open_saver(
             "tracking": poses.tracking,
             "trajectory": str(poses.trajectory or ""),
             "interpolate": poses.interpolate,
+            **({"into": str(output.into)} if output.into else {}),
         },
         color_camera=options.recording.color_camera,
         features=encoder.name if encoder else "",
@@ -76,10 +78,13 @@ def is_complete(folder: RunFolder, frames: int, options: RunOptions) -> bool:
     settled = replace(wanted, voxel_size=wanted.voxel_size or used.voxel_size).settled(())
     if options.cluster.wanted:  # what workers choose for themselves
         settled = replace(settled, threads=used.threads, map_memory=used.map_memory)
-    mode = record.tracking["mode"] if record.tracking else "given"
+    tracking = record.tracking or {"mode": "given"}
+    mode, into = tracking["mode"], tracking.get("joined", {}).get("into", "")
     asked = source_of(options.recording, frames, source and source.color)
     return (
-        source == asked
+        source is not None
+        and replace(source, before=()) == asked
+        and into == str(options.output.into or "")
         and settled == used
         and mode == options.poses.tracking
         and not (done.interrupted or record.errors)
@@ -103,14 +108,17 @@ def registered(
 def make_pipeline(
     options: RunOptions, encoder: ImageEncoder | None, folder: RunFolder, saver: RunSaver
 ) -> Pipeline:
-    """The pipeline of a run, with the maps of the safe point that it goes on from."""
+    """The pipeline of a run, with the maps of the safe point that it goes on from, or else of the run that
+    it is added to.
+    """
     from .. import runtime
     from ..pipeline import Pipeline
     from ..results.safe_point import read_maps, read_settings, restore_tiles
 
     if saver.resumed is None:
         shutil.rmtree(folder.working_tiles, ignore_errors=True)  # of a run that was killed
-        return Pipeline(options.settings, encoder=encoder, tiles=folder.working_tiles)
+        maps, tiles = maps_of(options, folder), folder.working_tiles
+        return Pipeline(options.settings, encoder=encoder, maps=maps, tiles=tiles)
     settings = options.settings
     runtime.init(settings.device, threads=settings.threads or None)
     state = saver.resumed.state

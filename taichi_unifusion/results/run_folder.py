@@ -203,6 +203,16 @@ class RunFolder:
         """The poses that a tracker found, as a run needs them that goes on."""
         return self.unfinished / "tracking.json"
 
+    @property
+    def placement(self) -> Path:
+        """Where a recording lies in the map that it is added to."""
+        return self.unfinished / "placement.json"
+
+    @property
+    def placed_keyframes(self) -> Path:
+        """The keyframes of both."""
+        return self.unfinished / self.keyframes.name
+
     def generation(self, number: int) -> Path:
         """Where the maps of a safe point lie."""
         return self.unfinished / f"generation-{number}"

@@ -7,6 +7,7 @@ They lie in a folder of their own inside the results folder:
                             settings with what was chosen by the first frames
     steps.jsonl             a line a frame, appended; `journal_bytes` of the state are valid
     tracking.json           the poses that a tracker found, once it was through
+    placement.json          where a recording lies in the map that it is added to; keyframes.log: of both
 
 A process that is killed while it saves leaves files that no state names; the next one removes them.
 """
@@ -266,7 +267,8 @@ def remove_safe_point(folder: RunFolder) -> None:
     with suppress(OSError):
         folder.state.unlink()
     keep_generation(folder, None)
-    for file in (folder.journal, folder.tracking_state):
+    own = (folder.journal, folder.tracking_state, folder.placement, folder.placed_keyframes)
+    for file in own:
         with suppress(OSError):
             file.unlink()
     remove_temporaries(folder)

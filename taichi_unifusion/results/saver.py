@@ -15,6 +15,8 @@ from ..files.atomic import file_error, write_text
 from ..pipeline import Pipeline
 from ..run_log import RunLog, RunSoFar
 from ..tracking import TrackingResult
+from ..tracking.keyframes import Keyframes
+from .placement import Placement, read_placement, write_placement
 from .record import Source
 from .run_folder import RunFolder
 from .safe_point import (
@@ -55,9 +57,9 @@ class RunSaver:
         saver = RunSaver(folder, recipe, seconds=60, resume=False)
         pipeline.run(frames, on_border=saver.at_border)
 
-    With `resume`, `resumed` is the run that the folder holds a safe point of, and `tracked` what its
-    tracker found, where there is such a thing. Raises InputError where its settings are others,
-    FileError where it is damaged.
+    With `resume`, `resumed` is the run that the folder holds a safe point of, `tracked` what its tracker
+    found, and `placed` where it lies in the map that it is added to, where there is such a thing. Raises
+    InputError where its settings are others, FileError where it is damaged.
     """
 
     def __init__(self, folder: RunFolder, recipe: Recipe, seconds: float, *, resume: bool) -> None:
@@ -65,7 +67,8 @@ class RunSaver:
         self.generation = self.steps = self.skipped = self.bytes = self.done = 0
         self.resumed: Resumed | None = None
         self.tracked = read_tracking(folder, recipe) if resume else None
-        self.fresh = self.tracked is None
+        self.placed = read_placement(folder, recipe) if resume else None
+        self.fresh = self.tracked is None and self.placed is None
         if resume and (state := read_state(folder)) is not None:
             check_same(recipe, state.recipe)
             self._go_on(Resumed(state, read_so_far(folder, state)))
@@ -88,6 +91,15 @@ class RunSaver:
         """Keep what a tracker found of all frames; raises FileError."""
         self._begin()
         write_tracking_state(self.folder, self.recipe, result)
+
+    def save_placement(self, placement: Placement, keyframes: Keyframes) -> None:
+        """Keep where a recording lies in the map that it is added to; raises FileError."""
+        self._begin()
+        write_placement(self.folder, self.recipe, placement, keyframes)
+
+    def save_soon(self) -> None:
+        """Make a safe point as soon as a window is fused: the run will write over what it began with."""
+        self.next = now()
 
     def _begin(self) -> None:
         """Remove what another run left, before the first of this one is written."""

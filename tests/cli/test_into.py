@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +13,14 @@ from scipy.spatial import cKDTree
 from taichi_unifusion.cli.main import main
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.files.mesh_reading import read_mesh
+from taichi_unifusion.files.tiles import TileFolder
 from taichi_unifusion.files.trajectories import read_trajectory
 from taichi_unifusion.geometry import se3
+from taichi_unifusion.maps.stored import read_stored
 from taichi_unifusion.maps.window_store import WindowStore
+from taichi_unifusion.pipeline import Pipeline
+from taichi_unifusion.results import read_record
+from taichi_unifusion.results.folder_writer import FolderWriter
 from taichi_unifusion.results.run_folder import RunFolder
 from taichi_unifusion.tracking.keyframe_file import read_keyframes
 
@@ -21,6 +28,7 @@ ROOM = ["synthetic", "--option", "frames=120", "--option", "width=240", "--optio
 SMALL = ["--voxel-size", "0.1", "--window", "4", "--device", "cpu", "--color-camera", "none"]
 SMALL += ["--mesh.resolution", "2", "--mesh.formats", "ply"]
 OFF = 0.002, 0.1  # [m, degrees] of a camera that found its place; 0.3 mm and 0.01 degrees are usual
+SECOND, THIRD = {"start": 8, "end": 16}, {"start": 12, "end": 20}
 APART = 0.002  # [m] between surfaces, in the mean
 
 
@@ -148,9 +156,9 @@ def test_a_recording_of_another_place_leaves_the_map_as_it_is(monday, capsys):
     ("words", "message"),
     [
         (["--voxel-size", "0.2"], "'voxel_size' is another one"),
-        (["--resume"], "--resume"),
+        (["--resume"], "let go of them with --forget"),
         (["--live"], "--live"),
-        (["--map-memory", "1GB"], "tiles"),
+        (["--workers", "2"], "--workers"),
     ],
 )
 def test_what_does_not_go_with_it_is_said(monday, capsys, words, message):
@@ -161,3 +169,83 @@ def test_what_does_not_go_with_it_is_said(monday, capsys, words, message):
 def test_a_folder_without_results_is_named(tmp_path, capsys):
     assert reconstruct("--into", str(tmp_path / "none"), end=8) == 2
     assert "config.yaml" in capsys.readouterr().err
+
+
+# --- Runs that are ended, and maps in tiles -------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """Ends a run as kill -9 does: nobody catches it."""
+
+
+def killed(patch, owner, name: str, call: int, *words: str, **frames: int) -> None:
+    """A run that dies when a function is called for the so manieth time."""
+    real, calls = getattr(owner, name), []
+
+    def dying(*arguments, **options):
+        calls.append(1)
+        if len(calls) == call:
+            raise Killed
+        return real(*arguments, **options)
+
+    with patch.context() as here:
+        here.setattr(owner, name, dying)
+        with pytest.raises(Killed):
+            reconstruct(*words, **frames)
+
+
+def voxels(folder: Path) -> dict[str, dict[str, bytes]]:
+    """All that the maps of a folder hold, in one order, wherever they lie."""
+    found = {}
+    for name, path in RunFolder(folder).maps.items():
+        tensors = read_stored(path)[1].tensors
+        order = np.lexsort(tensors["keys"].T)
+        found[name] = {each: values[order].tobytes() for each, values in tensors.items()}
+    return found
+
+
+@pytest.fixture(scope="module")
+def grown(monday, tmp_path_factory):
+    """The map of Monday with frames at given poses, of which no windows are kept."""
+    folder = tmp_path_factory.mktemp("grown") / "results"
+    assert reconstruct("--into", str(monday), "--forget", "--out", str(folder), **SECOND) == 0
+    return folder
+
+
+def test_a_run_that_is_ended_goes_on_in_the_folder_of_the_map(
+    monday, grown, tmp_path, monkeypatch, capsys
+):
+    """Ended after its safe point, and then while it writes over the map that it began with."""
+    folder = tmp_path / "results"
+    shutil.copytree(monday, folder)
+    words = ["--into", str(folder), "--forget"]
+    killed(monkeypatch, Pipeline, "step", 7, *words, **SECOND)
+    assert read_record(folder / "metrics.json").frames.used == 14  # as it was
+    words.append("--resume")
+    killed(monkeypatch, FolderWriter, "write", 3, *words, **SECOND)
+    assert "going on after 4 of 8 frames" in capsys.readouterr().err
+    assert reconstruct(*words, **SECOND) == 0
+    assert voxels(folder) == voxels(grown)
+    ours, theirs = (json.loads((f / "metrics.json").read_text()) for f in (folder, grown))
+    assert len(ours["recording"]["before"]) == len(theirs["recording"]["before"]) == 1
+    assert len(read_keyframes(folder / "keyframes.log")) == len(
+        read_keyframes(grown / "keyframes.log")
+    )
+    assert not RunFolder(folder).unfinished.exists() and not RunFolder(folder).temporaries
+    capsys.readouterr()
+    assert reconstruct(*words, **SECOND) == 0
+    assert "holds the whole run already" in capsys.readouterr().err
+
+
+def test_maps_in_tiles_are_added_to(monday, grown, tmp_path, monkeypatch):
+    """A map in one file grows into tiles, and these go on, also after the run was ended."""
+    tiled, again = tmp_path / "tiled", tmp_path / "again"
+    words = ["--into", str(monday), "--map-memory", "1GB", "--out", str(tiled)]
+    assert reconstruct(*words, **SECOND) == 0
+    assert TileFolder.is_one(RunFolder(tiled).maps["surface"]) and voxels(tiled) == voxels(grown)
+    assert reconstruct("--into", str(tiled), "--out", str(again), **THIRD) == 0
+    words = ["--into", str(tiled)]
+    killed(monkeypatch, Pipeline, "step", 7, *words, **THIRD)
+    assert reconstruct(*words, "--resume", **THIRD) == 0
+    assert voxels(tiled) == voxels(again) != voxels(grown)
+    assert main(["info", str(tiled)]) == 0
