@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,28 +16,17 @@ from ..types import Trajectory
 from .color_camera import AUTO
 from .into import Addition, remembered
 from .options import OutputOptions, RunOptions
+from .run import Mapped, Run
 from .viewing import map_frames
 
 if TYPE_CHECKING:
     from ..maps.window_store import WindowStore
-    from ..networks.encoders import ImageEncoder
     from ..pipeline import Pipeline
     from ..results import RunFolder
     from ..run_log import RunResult
     from ..tracking import CurrentPoses, TrackingResult
-    from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Mapped:
-    """Maps of a recording, and what made them."""
-
-    pipeline: Pipeline
-    run: RunResult
-    tracking: Mapping[str, Any] | None  # what to say of poses in the record
-    written: tuple[Path, ...]  # files that are in the folder already
 
 
 def in_one_pass(recording: Dataset, options: RunOptions) -> bool:
@@ -116,17 +105,8 @@ def keep_tracking(folder: RunFolder, result: TrackingResult) -> None:
     write_trajectory(folder.tracked_poses, result.trajectory)
 
 
-def map_in_one_pass(
-    recording: Dataset,
-    options: RunOptions,
-    folder: RunFolder,
-    stop: Callable[[], bool],
-    encoder: ImageEncoder | None,
-    watcher: Watcher,
-    *,
-    watched: bool,
-) -> Mapped:
-    """Track and fuse frames as they come, let the map follow, while it is `watched` or in the end, and
+def map_in_one_pass(recording: Dataset, made: Run) -> Mapped:
+    """Track and fuse frames as they come, let the map follow, while it is watched or in the end, and
     end with all of it at the final poses.
     """
     from .. import runtime
@@ -135,18 +115,22 @@ def map_in_one_pass(
     from ..tracking.online import OnlineFrames
     from ..tracking.sequence import concluded, say_warnings, write_tracking
 
-    poses, settings, started = options.poses, options.settings, time.perf_counter()
+    options, folder, started = made.options, made.folder, time.perf_counter()
+    poses, settings = options.poses, options.settings
+    watched = options.watch.view or options.watch.view_window
     runtime.init(settings.device, threads=settings.threads or None)
     tracker = _tracker(options)
     store = open_store(folder, options.output, settings, moves=True)
-    pipeline = Pipeline(settings, encoder=encoder, keep=store)
+    pipeline = Pipeline(settings, encoder=made.encoder, keep=store)
     if pipeline.follower is not None and not watched:  # nobody sees the map before its end
         pipeline.follower.budget = 0.0
     frames = OnlineFrames(recording, tracker, options.recording.every, following(pipeline))
     logger.info("tracking: %s, in one pass with mapping", poses.tracking)
     warnings = say_warnings(frames.frames, tracker)
     strict = options.recording.strict
-    run = map_frames(pipeline, frames, len(frames), strict=strict, stop=stop, watcher=watcher)
+    run = map_frames(
+        pipeline, frames, len(frames), strict=strict, stop=made.stop, watcher=made.watcher
+    )
     result = concluded(tracker, time.perf_counter() - started, warnings, run.interrupted)
     run = replace(
         run, skipped=tuple(replace(each, index=frames.place_of(each.index)) for each in run.skipped)
@@ -164,7 +148,7 @@ def map_in_one_pass(
         },
     }
     kept = remembered(
-        folder, recording[:: options.recording.every], run, store, None, pipeline.config, stop
+        folder, recording[:: options.recording.every], run, store, None, pipeline.config, made.stop
     )
     written = (*folder.tracking_files, *keep_store(folder, store), *kept)
     return Mapped(pipeline, run, details, written)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from tyro.conf import arg
@@ -17,42 +16,31 @@ from ..config import Config
 from ..datasets import Dataset
 from ..errors import InputError, PoseError
 from ..geometry.gravity import Up, parse_up
-from ..tracking import check_poses, track
-from ..tracking.sequence import PosedFrames
-from .color_camera import found_color, given_color
-from .following import (
-    Mapped,
-    in_one_pass,
-    keep_store,
-    keep_tracking,
-    map_in_one_pass,
-    open_store,
-)
+from ..tracking import check_poses
+from .color_camera import given_color
 from .interrupts import INTERRUPTED
-from .into import Addition, check_into, maps_of, placed, remembered
+from .into import check_into
 from .live import LiveOptions, reconstruct_live
-from .on_workers import check_workers, remove_shards, run_on_workers
+from .mapping import map_recording
+from .on_workers import check_workers, remove_shards
 from .options import (
     OutputOptions,
     RecordingOptions,
     Settings,
     TrackingOptions,
     open_recording,
-    source_of,
 )
 from .replacing import say_what_is_replaced
-from .resuming import end_saving, is_complete, make_pipeline, open_saver, registered
-from .terminal import DONE, FAILED, frame_progress, report
-from .viewing import WatchOptions, map_frames, run_watched
+from .resuming import end_saving, is_complete, open_saver
+from .run import Run
+from .terminal import DONE, FAILED, report
+from .viewing import WatchOptions, run_watched
 
 if TYPE_CHECKING:
     from ..language import EncoderChoice
     from ..networks.encoders import ImageEncoder
-    from ..results import RunFolder
-    from ..results.record import ColorRecord, Source
-    from ..results.saver import RunSaver
+    from ..results.record import ColorRecord
     from ..run_log import RunResult
-    from ..viewer.null import Watcher
 
 logger = logging.getLogger(__name__)
 
@@ -138,29 +126,19 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
             options.watch,
             folder,
             frames,
-            lambda watcher, stop: _fuse_and_write(
-                recording, color, options, folder, stop, encoder, up, watcher, saver
+            lambda watcher, stop: _map_and_write(
+                recording, color, up, Run(options, folder, saver, encoder, watcher, stop)
             ),
         )
 
 
-def _fuse_and_write(
-    recording: Dataset,
-    color: ColorRecord,
-    options: Reconstruct,
-    folder: RunFolder,
-    stop: Callable[[], bool],
-    encoder: ImageEncoder | None,
-    up: Up | None,
-    watcher: Watcher,
-    saver: RunSaver,
-) -> int:
+def _map_and_write(recording: Dataset, color: ColorRecord, up: Up | None, made: Run) -> int:
+    """Map the frames and write the results; the exit code."""
     from ..results.summary import summarize
     from ..results.writer import write_results
 
-    mapped, frames, source = _mapped(
-        recording, color, options, folder, stop, encoder, watcher, saver
-    )
+    folder = made.folder
+    mapped, frames, source = map_recording(recording, color, made)
     pipeline, run, written = mapped.pipeline, mapped.run, mapped.written
     if not run.steps:
         logger.warning(
@@ -183,108 +161,14 @@ def _fuse_and_write(
         remove_shards(folder.shards)
     print(
         json.dumps(results.record.to_json(), indent=2)
-        if options.output.json
+        if made.options.output.json
         else summarize(results.record, results.files, folder.path)
     )
     ended = [error for error in (run.failure, *results.failures) if error]
     code = report(ended)
     end_saving(folder, done=not (run.interrupted or ended))
     code = _report_missing(run, len(frames)) or code
-    return INTERRUPTED if stop() else code
-
-
-def _mapped(
-    recording: Dataset,
-    color: ColorRecord,
-    options: Reconstruct,
-    folder: RunFolder,
-    stop: Callable[[], bool],
-    encoder: ImageEncoder | None,
-    watcher: Watcher,
-    saver: RunSaver,
-) -> tuple[Mapped, Dataset, Source]:
-    """Track and map; also the frames that were to be mapped, and what the record keeps of them."""
-    every, wanted = options.recording.every, options.recording
-    if not options.cluster.wanted and in_one_pass(recording, options):
-        recording, color = found_color(recording, color)
-        watched = options.watch.view or options.watch.view_window
-        mapped = map_in_one_pass(
-            recording, options, folder, stop, encoder, watcher, watched=watched
-        )
-        frames = recording[::every]
-        return mapped, frames, source_of(wanted, len(frames), color)
-    tracking, tracked, written, added = None, None, (), None
-    if options.poses.tracked:
-        recording, tracking = _track(recording, options, folder, stop, saver)
-    recording, color = registered(recording, color, saver)
-    if options.output.into is not None:
-        added = placed(recording, options, saver, stop)
-        recording, tracking = added.frames, {**(tracking or {"mode": "given"}), **added.details}
-    if options.poses.tracked:
-        assert isinstance(recording, PosedFrames)
-        tracked, written = recording.tracking.frames, folder.tracking_files
-    frames = recording[::every]
-    source = replace(source_of(wanted, len(frames), color), before=added.sources if added else ())
-    saver.describe(source, tracking)
-    if options.cluster.wanted:
-        poses = tracked and tracked[::every]
-        mapped = Mapped(
-            *run_on_workers(
-                frames,
-                source,
-                poses,
-                options.settings,
-                options.cluster,
-                folder,
-                stop,
-                encoder=options.image_encoder,
-                resume=options.output.resume,
-            ),
-            None,
-            (),
-        )
-    else:
-        mapped = _map(frames, options, folder, stop, encoder, watcher, saver, added)
-        if added and written:
-            written = written if mapped.run.steps else ()
-            if written:  # now: in the folder of the map itself that ends its record
-                keep_tracking(folder, added.frames.tracking)
-    return replace(mapped, tracking=tracking, written=(*written, *mapped.written)), frames, source
-
-
-def _map(
-    frames: Dataset,
-    options: Reconstruct,
-    folder: RunFolder,
-    stop: Callable[[], bool],
-    encoder: ImageEncoder | None,
-    watcher: Watcher,
-    saver: RunSaver,
-    added: Addition | None = None,
-) -> Mapped:
-    """Fuse frames at the poses that they have, to maps that are there if they are added to some."""
-    from ..pipeline import Pipeline
-
-    output, store = options.output, None
-    if output.keep_windows or (added and added.windows and not output.forget):
-        store = open_store(folder, output, options.settings, moves=False, added=added)
-    if store is not None:
-        maps = maps_of(options, folder)
-        pipeline = Pipeline(options.settings, encoder=encoder, keep=store, maps=maps)
-    else:
-        pipeline = make_pipeline(options, encoder, folder, saver)
-    run = map_frames(
-        pipeline,
-        frames,
-        len(frames),
-        strict=options.recording.strict,
-        stop=stop,
-        watcher=watcher,
-        on_border=saver.at_border if store is None else None,
-        before=saver.resumed and saver.resumed.so_far,
-    )
-    kept = remembered(folder, frames, run, store, added, pipeline.config, stop)
-    return Mapped(pipeline, run, None, (*keep_store(folder, store), *kept))
+    return INTERRUPTED if made.stop() else code
 
 
 def _report_missing(run: RunResult, frames: int) -> int:
@@ -309,43 +193,3 @@ def _report_missing(run: RunResult, frames: int) -> int:
         "; --tracking rgbd finds poses from the frames alone" if unposed else "",
     )
     return FAILED if few else DONE
-
-
-def _track(
-    recording: Dataset,
-    options: Reconstruct,
-    folder: RunFolder,
-    stop: Callable[[], bool],
-    saver: RunSaver,
-) -> tuple[PosedFrames, Mapping[str, Any]]:
-    """The frames with the poses that are asked for, and what to say of them in the record.
-
-    All frames are tracked, whatever --every leaves for the map: small steps are easier. Poses are
-    written at once, so that they outlive whatever comes after; those of a recording that is added to a
-    map wait until its place is known.
-    """
-    from .. import runtime
-
-    if saver.tracked is not None:
-        posed = PosedFrames(recording, saver.tracked)
-        return posed, {"mode": options.poses.tracking, **posed.tracking.details}
-    poses, settings = options.poses, options.settings
-    runtime.init(settings.device, threads=settings.threads or None)
-    with frame_progress(len(recording)) as on_frame:
-        posed = track(
-            recording,
-            settings.tracking,
-            settings.preprocess,
-            mode=poses.tracking,
-            trajectory=poses.trajectory,
-            interpolate=poses.interpolate,
-            body_camera=poses.body_camera,
-            max_difference=options.recording.max_difference,
-            stop=stop,
-            on_frame=on_frame,
-        )
-    if options.output.into is None:
-        keep_tracking(folder, posed.tracking)
-    if not posed.tracking.interrupted:
-        saver.save_tracking(posed.tracking)
-    return posed, {"mode": poses.tracking, **posed.tracking.details}

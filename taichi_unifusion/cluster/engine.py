@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
@@ -19,6 +20,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 RETRIES = 5  # of work whose worker was lost
+STARTING = 15  # [s] that a worker may take to start before another is started in its place
 CONNECTING = 30  # [s] that a scheduler may take to answer
 KERNELS = "TI_OFFLINE_CACHE_FILE_PATH"  # where Taichi keeps them
 SLURM = "slurm:"
@@ -54,10 +56,13 @@ class ClusterSettings:
 
 
 class Engine:
-    """Runs functions in worker processes; only small values and paths go there and come back."""
+    """Runs functions in worker processes; only small values and paths go there and come back. Workers of
+    a `local` cluster that are lost before they could start are started again.
+    """
 
-    def __init__(self, client: Any) -> None:
-        self._client = client
+    def __init__(self, client: Any, local: Any = None) -> None:
+        self._client, self._local = client, local
+        self._restarts, self._looked = 0, 0.0
 
     @property
     def workers(self) -> int:
@@ -97,11 +102,26 @@ class Engine:
                     list(pending), timeout=0.5, return_when=dask_client.FIRST_COMPLETED
                 )
             except TimeoutError:
+                self._start_lost()
                 continue
             for _ in done:
                 on_done()
         self._client.cancel(list(pending))
         return [None if each in pending else _result(each) for each in futures]
+
+    def _start_lost(self) -> None:
+        """Start workers on this machine that Dask has given up, as it does with those that end while they
+        start; raises UniFusionError where that happens again and again.
+        """
+        now = time.monotonic()
+        if self._local is None or now < self._looked + STARTING:
+            return
+        if len(self._local.workers) == len(self._local.worker_spec):
+            return
+        self._restarts, self._looked = self._restarts + 1, now
+        if self._restarts > RETRIES * len(self._local.worker_spec):
+            raise UniFusionError("workers end before they have started, again and again")
+        self._local.scale(len(self._local.worker_spec))
 
 
 @contextmanager
@@ -161,12 +181,13 @@ def open_engine(settings: ClusterSettings) -> Iterator[Engine]:
         raise MissingDependency(LACKING) from None
     dask_config.set({"distributed.scheduler.allowed-failures": RETRIES})
     with ExitStack() as stack:
+        local = None
         if settings.cluster.startswith(SLURM):
             address = stack.enter_context(_slurm(settings.cluster.removeprefix(SLURM)))
         elif settings.cluster:
             address = settings.cluster
         else:
-            address = stack.enter_context(_local(distributed, settings.workers))
+            address = local = stack.enter_context(_local(distributed, settings.workers))
         try:
             client = stack.enter_context(distributed.Client(address, timeout=CONNECTING))
         except (OSError, ValueError, TimeoutError) as error:
@@ -174,7 +195,7 @@ def open_engine(settings: ClusterSettings) -> Iterator[Engine]:
                 f"--cluster {settings.cluster}: no scheduler answers there ({error}); start one with: dask scheduler"
             ) from None
         client.forward_logging("taichi_unifusion", level=logging.WARNING)
-        yield Engine(client)
+        yield Engine(client, local)
 
 
 def _local(distributed: Any, workers: int) -> Any:

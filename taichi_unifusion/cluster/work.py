@@ -103,7 +103,7 @@ def vote(job: Job, shard: Shard, merged: str) -> int:
         if frame.index in used:
             voters.add(frame)
     shutil.rmtree(folder / VOTES, ignore_errors=True)
-    TileFolder.create(folder / VOTES, VOTES_MANIFEST).write(voters.votes())
+    TileFolder.create(folder / VOTES, VOTES_MANIFEST).write(voters.votes().items())
     return len(used)
 
 

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -115,15 +116,15 @@ class TileFolder:
 
         return read_map(file, check=check_tile)[0], file
 
-    def write(self, tiles: Mapping[Tile, Mapping[str, NDArray]]) -> None:
-        """Replace tiles by arrays, or remove those that have none left; all of them or, where that
-        fails, none. Raises FileError.
+    def write(self, tiles: Iterable[tuple[Tile, Mapping[str, NDArray]]]) -> None:
+        """Replace tiles by arrays, as they come, or remove those that have none left; all of them or, where
+        that fails, none. Raises FileError.
         """
-        replaced = [self.path / self.tiles[tile].file for tile in tiles if tile in self.tiles]
-        before, written = dict(self.tiles), []
+        before, written, replaced = dict(self.tiles), [], []
         try:
-            for tile, tensors in tiles.items():
-                self.tiles.pop(tile, None)
+            for tile, tensors in tiles:
+                if tile in self.tiles:
+                    replaced.append(self.path / self.tiles.pop(tile).file)
                 if not len(tensors["keys"]):
                     continue
                 file = self.path / f"{'_'.join(map(str, tile))}.{self._turn}.safetensors"
@@ -142,13 +143,9 @@ class TileFolder:
 
     def write_each(self, tiles: Iterable[tuple[Tile, Mapping[str, NDArray]]]) -> None:
         """Replace many tiles, as they come; the index is written for some at a time. Raises FileError."""
-        waiting: dict[Tile, Mapping[str, NDArray]] = {}
-        for tile, tensors in tiles:
-            waiting[tile] = tensors
-            if len(waiting) == AT_ONCE:
-                self.write(waiting)
-                waiting = {}
-        self.write(waiting)
+        tiles = iter(tiles)
+        while waiting := list(islice(tiles, AT_ONCE)):
+            self.write(waiting)
 
     def adopt(self, other: TileFolder) -> None:
         """Take over the tiles of another folder, in place of those that are here; all of them or, where

@@ -94,13 +94,13 @@ class WorkingSet:
         slots, of = slots[order], of[order]
         ends = np.searchsorted(of, sorted(wanted), side="right")
         begins = np.searchsorted(of, sorted(wanted), side="left")
-        tiles = {
-            tile_of(code): grid.take(slots[begin:end]).tensors
+        tiles = [
+            (tile_of(code), slots[begin:end])
             for code, begin, end in zip(sorted(wanted), begins, ends, strict=True)
             if end > begin or tile_of(code) in self.folder.tiles
-        }
+        ]
         if tiles:
-            self.folder.write(tiles)
+            self.folder.write((tile, grid.take(rows).tensors) for tile, rows in tiles)
         self.changed -= wanted
         self.loaded |= {code for code in wanted if tile_of(code) in self.folder.tiles}
 

@@ -39,6 +39,20 @@ def test_work_is_done_elsewhere_and_again_where_a_worker_is_lost(tmp_path):
     assert os.getpid() not in {each[1] for each in found[:3]} and len(done) == 4
 
 
+def test_workers_that_are_given_up_are_started_again(tmp_path, monkeypatch):
+    """As Dask gives up those that end while they start; without others the work would wait forever."""
+    monkeypatch.setattr("taichi_unifusion.cluster.engine.STARTING", 3)
+    with open_engine(ClusterSettings(workers=1)) as engine:
+        cluster = engine._local
+        cluster.sync(cluster.workers[0].close)
+        wait_for(lambda: not engine.workers)
+        del cluster.workers[0]
+        deadline = time.monotonic() + 120
+        found = engine.map(double, [(1, str(tmp_path))], stop=lambda: time.monotonic() > deadline)
+        assert found[0] and found[0][0] == 2
+        assert engine.workers == 1
+
+
 def test_nobody_answers_at_the_address(monkeypatch):
     monkeypatch.setattr("taichi_unifusion.cluster.engine.CONNECTING", 2)
     cluster = ClusterSettings(cluster="tcp://127.0.0.1:1")

@@ -169,26 +169,39 @@ def one_tile(n: int = 3) -> dict[str, np.ndarray]:
 
 def test_a_tile_is_replaced_as_a_whole(tmp_path):
     folder = TileFolder.create(tmp_path / "map", {"kind": "x"})
-    folder.write({(0, 0, 0): one_tile(), (1, 0, -1): one_tile(5)})
-    folder.write({(0, 0, 0): one_tile(4)})
+    folder.write({(0, 0, 0): one_tile(), (1, 0, -1): one_tile(5)}.items())
+    folder.write({(0, 0, 0): one_tile(4)}.items())
     again = TileFolder.open(tmp_path / "map")
     assert again.voxels == 9 and len(list(again.path.iterdir())) == 3
     assert len(again.read((0, 0, 0), unchecked)[0]["keys"]) == 4
-    again.write({(1, 0, -1): one_tile(0)})
+    again.write({(1, 0, -1): one_tile(0)}.items())
     assert set(TileFolder.open(tmp_path / "map").tiles) == {(0, 0, 0)}
     assert len(list(again.path.iterdir())) == 2
 
 
+def test_a_tile_is_on_disk_before_the_next_is_asked_for(tmp_path):
+    """So whoever writes many holds one."""
+    folder = TileFolder.create(tmp_path / "map", {"kind": "x"})
+
+    def tiles():
+        for n in range(3):
+            assert len(list(folder.path.glob("*.safetensors"))) == n
+            yield (n, 0, 0), one_tile()
+
+    folder.write(tiles())
+    assert len(TileFolder.open(folder.path).tiles) == 3
+
+
 def test_what_cannot_be_written_leaves_the_tiles_as_they_were(tmp_path, monkeypatch):
     folder = TileFolder.create(tmp_path / "map", {"kind": "x"})
-    folder.write({(0, 0, 0): one_tile()})
+    folder.write({(0, 0, 0): one_tile()}.items())
 
     def full(*_):
         raise FileError("the disk is full")
 
     monkeypatch.setattr("taichi_unifusion.files.tiles.write_text", full)
     with pytest.raises(FileError, match="full"):
-        folder.write({(0, 0, 0): one_tile(4), (2, 0, 0): one_tile(4)})
+        folder.write({(0, 0, 0): one_tile(4), (2, 0, 0): one_tile(4)}.items())
     assert set(folder.tiles) == {(0, 0, 0)} and len(list(folder.path.iterdir())) == 2
     assert len(TileFolder.open(tmp_path / "map").read((0, 0, 0), unchecked)[0]["keys"]) == 3
 
@@ -212,7 +225,7 @@ def test_what_cannot_be_written_leaves_the_tiles_as_they_were(tmp_path, monkeypa
 )
 def test_a_bad_index_is_refused(tmp_path, change, message):
     folder = TileFolder.create(tmp_path, {"kind": "x"})
-    folder.write({(0, 0, 0): one_tile()})
+    folder.write({(0, 0, 0): one_tile()}.items())
     values = json.loads((tmp_path / "index.json").read_text()) | change
     (tmp_path / "index.json").write_text(json.dumps(values))
     with pytest.raises(MapCorrupt, match=message):
@@ -221,7 +234,7 @@ def test_a_bad_index_is_refused(tmp_path, change, message):
 
 def test_a_tile_under_another_name_is_refused(tmp_path):
     folder = TileFolder.create(tmp_path, {"kind": "x"})
-    folder.write({(0, 0, 0): one_tile(), (1, 0, 0): one_tile()})
+    folder.write({(0, 0, 0): one_tile(), (1, 0, 0): one_tile()}.items())
     folder.tiles[0, 0, 0] = folder.tiles[1, 0, 0]
     with pytest.raises(MapCorrupt, match="holds tile"):
         folder.read((0, 0, 0), unchecked)

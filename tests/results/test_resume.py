@@ -17,7 +17,7 @@ import pytest
 from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 
 from taichi_unifusion.cli import main as cli
-from taichi_unifusion.cli import reconstruct
+from taichi_unifusion.cli import mapping
 from taichi_unifusion.config import dump_config
 from taichi_unifusion.errors import FileError, InputError
 from taichi_unifusion.maps import working_set
@@ -317,7 +317,7 @@ def test_a_run_that_is_stopped_is_written_and_can_go_on(tmp_path, monkeypatch, c
     def again(*arguments, **options):
         raise AssertionError("frames are tracked a second time")
 
-    monkeypatch.setattr(reconstruct, "track", again)
+    monkeypatch.setattr(mapping, "track", again)
     assert cli.main([*arguments, "--resume"]) == 0
     for name in ("surface", "color"):
         assert out.map(name).read_bytes() == undisturbed.map(name).read_bytes()
