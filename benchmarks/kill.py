@@ -3,12 +3,13 @@ map of an undisturbed one.
 
     python benchmarks/kill.py --kills 100
 
-Each process gets `--resume` and dies after a random time, until one comes through; then the next run
-begins. Prints how often, where it was, what was found, and what safe points cost.
+Each process gets `--resume` and dies after a random time of the processor (Linux), until one comes
+through; then the next run begins. Prints how often, where it was, and what was found.
 """
 
 from __future__ import annotations
 
+import os
 import random
 import re
 import shutil
@@ -21,6 +22,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import tyro
 
 from taichi_unifusion.results import RunFolder, inspect
@@ -58,17 +60,30 @@ def command(out: Path, options: Options, *more: str, share: str = EAGER) -> list
     ]
 
 
-def run(arguments: list[str], after: float | None = None) -> tuple[int, str]:
-    """Exit code and messages of a process, killed after so many seconds."""
-    process = subprocess.Popen(
-        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
+def run(arguments: list[str], after: float = np.inf) -> tuple[int, str, float]:
+    """Exit code and messages of a process, killed after so many seconds of processor time, and how many it
+    took: seconds of a clock would depend on what else the machine does.
+    """
+    with tempfile.TemporaryFile("w+") as said:
+        process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=said, text=True)
+        spent = 0.0
+        while process.poll() is None:
+            time.sleep(0.01)
+            spent = max(spent, processor_seconds(process.pid))
+            if spent > after:
+                process.send_signal(signal.SIGKILL)
+                process.wait()
+        said.seek(0)
+        return process.returncode, said.read(), spent
+
+
+def processor_seconds(pid: int) -> float:
+    """Of all threads of a process (Linux); 0 once it has ended."""
     try:
-        said = process.communicate(timeout=after)[1]
-    except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGKILL)
-        said = process.communicate()[1]
-    return process.returncode, said
+        values = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def contents(folder: RunFolder) -> dict[str, bytes]:
@@ -90,16 +105,14 @@ def main(options: Options) -> int:
     place = Path(tempfile.mkdtemp(prefix="unifusion-kill-"))
     chance, wrong, moments, finished, kills = random.Random(options.seed), [], Counter(), 0, 0
     try:
-        began = time.monotonic()
-        code, said = run(command(place / "whole", options, "--save-every", "0"))
+        code, said, took = run(command(place / "whole", options, "--save-every", "0"))
         assert code == 0, said
-        took = time.monotonic() - began
         expected = contents(RunFolder(place / "whole"))
         folder = RunFolder(place / "killed")
         began = time.monotonic()
         while kills < options.kills and time.monotonic() - began < 60 * options.minutes:
             arguments = command(folder.path, options, "--save-every", "0.05", "--resume")
-            code, said = run(arguments, chance.uniform(0.1, 1.4) * took)
+            code, said, _ = run(arguments, chance.uniform(0.1, 1.1) * took)
             if code == -signal.SIGKILL:
                 kills += 1
                 moments[moment_of(folder, said)] += 1

@@ -31,6 +31,8 @@ from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.evaluation import Viewpoints, evaluate_rendering, evaluate_surface
 from taichi_unifusion.files.record_file import pack
 from taichi_unifusion.geometry import se3
+from taichi_unifusion.maps import BaseMap
+from taichi_unifusion.maps.voxel_data import VoxelData
 from taichi_unifusion.maps.window_store import WindowStore, to_record
 from taichi_unifusion.pipeline import Pipeline
 from taichi_unifusion.types import Frame, Mesh
@@ -39,6 +41,7 @@ WIGGLE = 0.2  # of the drift, across its direction, that no loop knows of
 TURN = np.radians(0.3) / 0.05  # [rad/m] of drift
 BEHIND = 0.10  # [m] a second surface this near behind the first is a double one
 SKIN = 0.004  # [m] behind a hit from where on the ray is looked at again
+SHOWN = 100  # cycles between two looks at the maps
 STRIDE = 4  # pixels between the rays that ask for double surfaces
 
 
@@ -270,8 +273,8 @@ def sizes(store: WindowStore) -> list[str]:
 
 def cycle(count: int) -> None:
     """Take a window out and put it back elsewhere and here again, `count` times."""
-    room = SyntheticRoom(frames=120, width=160, height=120)
-    pipeline = Pipeline(replace(Config(), window=5), keep=WindowStore())
+    room = SyntheticRoom(frames=120, width=80, height=60)
+    pipeline = Pipeline(replace(Config(), window=5, voxel_size=0.1), keep=WindowStore())
     for i in range(10):
         pipeline.step(room[i])
     pipeline.flush()
@@ -280,17 +283,25 @@ def cycle(count: int) -> None:
     before = {name: each.voxels() for name, each in pipeline.maps.items()}
     home = store.windows[1].T_world_keyframe
     there = se3.exp(np.array([0.02, -0.01, 0.015, 0.01, 0.0, -0.02])) @ home
-    for _ in range(count):
+    for done in range(1, count + 1):
         for place in (there, home):
             follower.move_to({1: place})
             follower.work(np.inf)
-    for name, each in pipeline.maps.items():
-        now = each.voxels()
-        same = len(now) == len(before[name]) and all(
-            np.array_equal(now.tensors[part], before[name].tensors[part])
-            for part in ("keys", "latents", "weights", "masks")
-        )
-        print(f"{name}: after {count} cycles {'the same to the bit' if same else 'CHANGED'}")
+        if done % SHOWN == 0 or done == count:
+            states = [
+                f"{name} {'the same to the bit' if same(each, before[name]) else 'CHANGED'}"
+                for name, each in pipeline.maps.items()
+            ]
+            print(f"after {done} cycles: {', '.join(states)}", flush=True)
+
+
+def same(lim: BaseMap, before: VoxelData) -> bool:
+    """Whether a map holds the very voxels that it held before."""
+    now = lim.voxels()
+    return len(now) == len(before) and all(
+        np.array_equal(now.tensors[part], before.tensors[part])
+        for part in ("keys", "latents", "weights", "masks")
+    )
 
 
 def main() -> int:
