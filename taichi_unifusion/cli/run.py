@@ -5,16 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
+
+from .options import RunOptions
 
 if TYPE_CHECKING:
+    from ..language import EncoderChoice
     from ..networks.encoders import ImageEncoder
     from ..pipeline import Pipeline
     from ..results import RunFolder
     from ..results.saver import RunSaver
     from ..run_log import RunResult
     from ..viewer.null import Watcher
-    from .reconstruct import Reconstruct
+    from .viewing import WatchOptions
+
+
+class MapOptions(RunOptions, Protocol):
+    """The options of a command that makes maps of a recording."""
+
+    @property
+    def watch(self) -> WatchOptions: ...
+    @property
+    def image_encoder(self) -> EncoderChoice | None: ...
 
 
 @dataclass(frozen=True)
@@ -23,7 +35,7 @@ class Run:
     what says that it is to stop.
     """
 
-    options: Reconstruct
+    options: MapOptions
     folder: RunFolder
     saver: RunSaver
     encoder: ImageEncoder | None  # of image-text features, if they are mapped
