@@ -112,10 +112,12 @@ def _tracks(container: Any, path: Path) -> dict[str, Any]:
             f"{path}: has no track DEPTH (it has {', '.join(map(_title, container.streams.video)) or 'no images'}); "
             "give the .mkv file of an Azure Kinect"
         )
-    for title in (DEPTH, INFRARED):
-        if title in streams and streams[title].codec_context.pix_fmt != "gray16be":
+    for title, stream in streams.items():
+        if stream.codec_context is None:
+            raise DatasetError(f"{path}: track {title} is of a codec that is not known here")
+        if title != COLOR and stream.codec_context.pix_fmt != "gray16be":
             raise DatasetError(
-                f"{path}: track {title} is {streams[title].codec_context.pix_fmt}, not 16-bit big-endian"
+                f"{path}: track {title} is {stream.codec_context.pix_fmt}, not 16-bit big-endian"
             )
     return streams
 
@@ -125,7 +127,7 @@ def _opened(path: Path) -> Iterator[Any]:
     """The file as a PyAV container; what PyAV cannot read becomes a DatasetError."""
     av = _import_av()
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             yield container
     except av.error.FFmpegError as error:
         raise DatasetError(

@@ -36,10 +36,12 @@ class VideoPictures:
                 f"{path}: a video is read with PyAV; run: pip install 'taichi-unifusion[phone]'"
             ) from None
         try:
-            with av.open(str(path)) as container:
+            with av.open(str(path), metadata_errors="replace") as container:
                 if not container.streams.video:
                     raise DatasetError(f"{path}: holds no video track")
                 stream: Any = container.streams.video[0]
+                if stream.codec_context is None:
+                    raise DatasetError(f"{path}: its video is of a codec that is not known here")
                 self.size: tuple[int, int] = stream.codec_context.width, stream.codec_context.height
                 stamps = {
                     packet.pts for packet in container.demux(stream) if packet.pts is not None
@@ -81,7 +83,7 @@ class VideoPictures:
         import av
 
         if self._container is None:
-            self._container = av.open(str(self.path))
+            self._container = av.open(str(self.path), metadata_errors="replace")
             self._container.streams.video[0].thread_type = "AUTO"
         stream = self._container.streams.video[0]
         self._container.seek(self.stamps[number], stream=stream, backward=True)

@@ -196,6 +196,25 @@ def test_I4_a_recording_that_is_cut_off_gives_the_frames_before_the_cut(tmp_path
             dataset[2]
 
 
+def test_I1_tags_that_are_no_text_harm_nothing(tmp_path, recording):
+    data = recording.read_bytes()
+    odd = tmp_path / "odd.mkv"
+    odd.write_bytes(data.replace(b"Lavf", b"La\xfff"))
+    assert odd.read_bytes() != data
+    np.testing.assert_array_equal(
+        open_dataset("k4a", odd)[0].depth, open_dataset("k4a", recording)[0].depth
+    )
+
+
+def test_I1_a_track_of_an_unknown_codec_is_one_sentence(tmp_path, recording):
+    data = recording.read_bytes()
+    odd = tmp_path / "odd.mkv"
+    odd.write_bytes(data.replace(b"V_MJPEG", b"V_NJPEG"))
+    assert odd.read_bytes() != data
+    with pytest.raises(DatasetError, match="odd.mkv: track COLOR is of a codec that is not known"):
+        open_dataset("k4a", odd)
+
+
 def test_without_pyav_one_sentence_says_what_to_install(recording, monkeypatch):
     real = builtins.__import__
 
