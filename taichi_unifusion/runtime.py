@@ -181,7 +181,7 @@ def init(
     `threads` caps the CPU threads, `device_memory_gb` is CUDA's fixed pool for sparse voxels [GiB]
     (a quarter of the GPU's memory, 1 to 8), `debug` checks array bounds. Raises InputError for an
     unknown device and a pool larger than the GPU, RuntimeStateError where CUDA is asked for and
-    absent, or another device is live.
+    absent, another device is live, or the current folder is gone.
     """
     global _runtime
     check_choice("device", device, DEVICES)
@@ -193,6 +193,12 @@ def init(
         raise RuntimeStateError(
             f"device: Taichi already runs on {_runtime.device}; start a new process to use {device}"
         )
+    try:
+        os.getcwd()  # Taichi asks for it
+    except FileNotFoundError:
+        raise RuntimeStateError(
+            "the folder that this process was started in is gone; change to one that exists"
+        ) from None
     ti = import_taichi()
     if not debug:
         _quicken_tracing()

@@ -8,6 +8,7 @@ it is used, so that `--help` is there at once. UNIFUSION_DEBUG=1 shows traceback
 from __future__ import annotations
 
 import argparse
+import ast
 import dataclasses
 import inspect
 import logging
@@ -141,16 +142,24 @@ def _run(prog: str, description: str, commands: Commands, argv: list[str]) -> in
         return FAILED
     options, command = commands[name]
     if isinstance(command, dict):
-        return _run(f"{prog} {name}", inspect.getdoc(options) or "", command, arguments)
+        return _run(f"{prog} {name}", _docstring(options), command, arguments)
     parsed = _parse(f"{prog} {name}", options, arguments)
     with redirect_stdout(PlainOutput(sys.stdout)), local_copies(parsed) as local:
         return command(local)
 
 
+def _docstring(options: type) -> str:
+    """What a command says of itself; from its source where Python was told to drop docstrings (-OO)."""
+    if sys.flags.optimize < 2:
+        return inspect.getdoc(options) or ""
+    (body,) = ast.parse(inspect.getsource(options)).body
+    return ast.get_docstring(body) or "" if isinstance(body, ast.ClassDef) else ""
+
+
 def _say_commands(prog: str, description: str, commands: Commands, arguments: list[str]) -> None:
     kinds = (
         Annotated[
-            options, subcommand(name, description=(inspect.getdoc(options) or name).splitlines()[0])
+            options, subcommand(name, description=(_docstring(options) or name).splitlines()[0])
         ]
         for name, (options, _) in commands.items()
     )
@@ -161,12 +170,13 @@ def _say_commands(prog: str, description: str, commands: Commands, arguments: li
 
 def _parse(prog: str, options: type, arguments: list[str]) -> Any:
     """The options of a command; the file that --config names gives the defaults of the settings."""
+    told = _docstring(options)
     if "settings" not in options.__dataclass_fields__:
         with whole_sentences():
-            return tyro.cli(options, prog=prog, args=arguments)
+            return tyro.cli(options, prog=prog, args=arguments, description=told)
     if {"-h", "--help"} & set(arguments) and options is not ShowConfig:
         with few_settings(), whole_sentences():
-            return tyro.cli(options, prog=prog, args=arguments)
+            return tyro.cli(options, prog=prog, args=arguments, description=told)
     arguments = with_long_names(arguments)
     finder = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     finder.add_argument("--config", nargs="?")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from types import FrameType
 
 INTERRUPTED = 130  # exit code
@@ -13,6 +14,7 @@ INTERRUPTED = 130  # exit code
 
 def main() -> int:
     """Run the command line of this process and return its exit code."""
+    open_what_is_closed()
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:  # else somebody wants it ignored
         signal.signal(signal.SIGTERM, _as_ctrl_c)
     try:
@@ -30,6 +32,20 @@ def main() -> int:
         if callable(signal.getsignal(number)):
             signal.signal(number, end)
     return code
+
+
+def open_what_is_closed() -> None:
+    """Let standard input, output and error that were closed read and write nothing; else the next files
+    that are opened, maps among them, would take their numbers, and get what is printed.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, this one
+            if getattr(sys, name) is None:
+                mode = "r" if number == 0 else "w"
+                setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
 
 
 def _as_ctrl_c(number: int, frame: FrameType | None) -> None:
