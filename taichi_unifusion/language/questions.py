@@ -61,9 +61,10 @@ def ask(
         _scores(features, mesh.vertices[first : first + POINTS_AT_ONCE], both, distances)
         for first in range(0, max(len(mesh.vertices), 1), POINTS_AT_ONCE)
     ]
-    similarity, scores = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    similarity, scores, plain = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     regions = [
-        find_regions(mesh, column, threshold=threshold, min_area=min_area) for column in scores.T
+        find_regions(mesh, column, extent=extent, threshold=threshold, min_area=min_area)
+        for column, extent in zip(scores.T, plain.T, strict=True)
     ]
     return [
         Answer(text, scores[:, i], similarity[:, i], tuple(regions[i]))
@@ -73,23 +74,24 @@ def ask(
 
 def _scores(
     features: Features, points: NDArray, both: NDArray, distances: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Similarity and relevance (N, n) of n queries, which come before their m rivals in `both`, at
-    `distances` (n, m).
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Similarity, relevance and relevance without a margin (N, n) of n queries, which come before their
+    m rivals in `both`, at `distances` (n, m).
 
-    Rivals' similarities are raised by SURE standard deviations of noise: a query must win clearly,
-    so that rarely seen surface rarely matches.
+    The margin: rivals' similarities are raised by SURE standard deviations of noise, so that a query
+    must win clearly and rarely seen surface rarely matches.
     """
     similarity, known = features.similarity(points, both, return_valid=True)
     margin = SURE * features.uncertainty(points)[:, None]
-    count, scores = len(distances), []
+    count, scores, plain = len(distances), [], []
     for i, away in enumerate(distances):
         rivals = np.flatnonzero(np.isfinite(away))
-        strongest = (similarity[:, count + rivals] + margin * away[rivals].astype(np.float32)).max(
-            axis=1
-        )
-        scores.append(np.where(known, relevance(similarity[:, i], strongest), np.float32(0)))
-    return similarity[:, :count], np.stack(scores, axis=1)
+        others = similarity[:, count + rivals]
+        raised = others + margin * away[rivals].astype(np.float32)
+        for found, rival in ((scores, raised), (plain, others)):
+            strongest = rival.max(axis=1)
+            found.append(np.where(known, relevance(similarity[:, i], strongest), np.float32(0)))
+    return similarity[:, :count], np.stack(scores, axis=1), np.stack(plain, axis=1)
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,46 @@ def test_pieces_a_few_centimetres_apart_are_one_region():
     assert len(find_regions(small, np.full(200, 0.9), min_area=0.015, join=0.05)) == 1
 
 
+def test_a_region_goes_on_where_the_query_merely_wins():
+    mesh = squares(0, 3)
+    column = np.tile(np.arange(10), 20)  # of each square's grid, 0..9 along x
+    extent = np.full(200, 0.8)
+    certain = np.where(column < 5, 0.9, 0.2)
+    certain[100:] = 0.2  # nothing of the second square is certain
+    (region,) = find_regions(mesh, certain, extent=extent)
+    np.testing.assert_allclose(region.box, [[0, 0, 0], [1, 1, 0]], atol=1e-5)
+    assert region.area == pytest.approx(1, abs=1e-4) and len(region.vertices) == 100
+    assert region.score == pytest.approx(0.9)  # of what is certain
+    # as large as min_area, or three tenths of the region, must be certain
+    few = np.where(column < 1, 0.9, 0.2)
+    assert len(find_regions(mesh, few, extent=extent, min_area=0.01)) == 2
+    assert find_regions(mesh, few, extent=extent, min_area=0.5) == []
+    assert [region.area for region in find_regions(mesh, few)] == pytest.approx([1 / 18] * 2)
+
+
+@pytest.mark.parametrize(("share", "regions"), [(1.0, 2), (0.15, 1)])
+def test_what_faces_each_other_is_two_things_unless_one_is_a_small_piece(share, regions):
+    near, far = squares(0), squares(0, size=np.sqrt(share))
+    turned = far.vertices + np.float32([0, 0, 0.04])
+    mesh = Mesh(
+        np.concatenate([near.vertices, turned]),
+        np.concatenate([near.faces, far.faces[:, ::-1] + 100]),
+    )
+    assert len(find_regions(mesh, np.full(200, 0.9))) == regions
+
+
+def test_surface_of_something_else_keeps_pieces_apart():
+    size = 0.09  # a step of 1 cm
+    mesh = squares(0, size=size)
+    column = np.tile(np.arange(10), 10)
+    score = np.where((column > 3) & (column < 7), 0.1, 0.9)  # 4 cm from the left to the right piece
+    assert len(find_regions(mesh, score, min_area=0.001)) == 2
+    gone = (column > 3) & (column < 7)
+    hole = Mesh(mesh.vertices, mesh.faces[~gone[mesh.faces].any(axis=1)])
+    spots = np.where(gone[:, None], np.float32(9), hole.vertices)  # a hole has no vertices either
+    assert len(find_regions(Mesh(spots, hole.faces), score, min_area=0.001)) == 1
+
+
 def test_the_reason_agrees_with_its_numbers():
     mesh = squares(0)
     low, high = (
