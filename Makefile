@@ -1,7 +1,7 @@
 # From a bare Debian or Ubuntu machine with Python 3.11-3.13 to a result: `make demo`, `make test`.
 # `make demo PYTHON=python3.12` chooses the interpreter; `make test PYTEST_ARGS="-k surface"` hands options to pytest.
 # WORKERS processes share the tests, a file at a time, so that fixtures of a file are made once; each takes 1 to 2 GB.
-.PHONY: demo test fuzz soak viewers validator lint types format setup
+.PHONY: demo test fuzz debug soak viewers validator lint types format setup
 
 WORKERS ?= 2
 
@@ -21,6 +21,10 @@ test: setup
 fuzz: setup
 	UNIFUSION_FUZZ=20000 .venv/bin/python -m pytest -n $(WORKERS) tests/fuzz/test_fuzz.py $(FUZZ)
 	UNIFUSION_FUZZ=2000 .venv/bin/python -m pytest -n $(WORKERS) tests/fuzz/test_readers.py tests/fuzz/test_phones.py $(FUZZ)
+
+# Kernels of maps, tracking and pictures with checks of every index and sum: half a minute.
+debug: setup
+	UNIFUSION_DEBUG_KERNELS=1 .venv/bin/python -m pytest tests/maps/test_debug_mode.py
 
 # Ten thousand frames of one scene: memory must not grow.
 soak: setup
