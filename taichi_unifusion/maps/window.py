@@ -333,6 +333,7 @@ class WindowFusion:
         """End the window: what fuses it waits in `pieces`, after what was there before."""
         if self.window is not None:
             self.run(len(self.pieces))
+            self._rehearsals.clear()  # they would take the arena from under the work itself
             self.pieces.extend(self.window.close(self.keep))
             self.window = None
             self.settle()

@@ -10,7 +10,7 @@ from windows import CAMERA, CONFIG, SINGLE, contents, seen_from, stepped, walk, 
 
 from taichi_unifusion import PinholeCamera, load_map, preprocess
 from taichi_unifusion.config import Config
-from taichi_unifusion.maps import SurfaceMap
+from taichi_unifusion.maps import SurfaceMap, window
 from taichi_unifusion.maps.window import FARTHEST_MOVE, GAP, LARGEST_TURN
 
 
@@ -29,6 +29,14 @@ def test_a_window_ends_with_so_many_frames(frames):
     assert windows(frames) == [1, 2, 3, 0, 1, 2, 3, 0]
     assert windows(frames[:3], SINGLE) == [0, 0, 0]
     assert windows(frames[:3], replace(CONFIG, window=2)) == [1, 0, 1]
+
+
+def test_a_frame_that_fills_a_window_by_itself_is_fused_alone(frames, monkeypatch):
+    """The first frame too, for which kernels are compiled ahead."""
+    alone = contents(stepped(frames[:2], SINGLE))
+    monkeypatch.setattr(window, "ROOM", 0)  # a large image of something far
+    assert windows(frames[:2]) == [0, 0]
+    assert contents(stepped(frames[:2])) == alone
 
 
 def moved_by(frame, metres: float = 0.0, degrees: float = 0.0):
