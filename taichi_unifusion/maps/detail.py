@@ -13,9 +13,7 @@ from .settings import MapSettings
 
 Detail = Literal["auto", "fine", "coarse"]
 
-ROOM = (
-    0.05  # [m] surface voxels of a room, which other sizes are relative to, and the largest chosen
-)
+ROOM = 0.05  # [m] surface voxels of a room, which other sizes are relative to
 STEPS = (
     0.005,
     0.0075,
@@ -29,6 +27,9 @@ STEPS = (
 # Voxels grow with depth a little faster than pixels do, since noise does: measured from 0.4 to 3 m.
 AT_ONE_METRE, EXPONENT = 0.034, 1.3
 PIXELS = 8  # that a voxel spans at least: fewer hold too few samples
+# A hall: farther than `depth_max` lets a room be seen. Its voxels follow the pixels: of 320 x 240 at 8 m, voxels of 5 cm
+# (1.7 pixels) leave 61 % of the surface out, of 7.5 cm 42 %, of 10 cm 4 %.
+HALL, PIXELS_OF_HALL, STEPS_OF_HALL = 5.0, 3.4, (ROOM, 0.075, 0.1, 0.15, 0.2)
 TIMES = {"auto": 1.0, "fine": 0.5, "coarse": 2.0}
 
 
@@ -54,13 +55,16 @@ def sight_of(frames: Iterable[Frame], depth_min: float, depth_max: float) -> Sig
 
 
 def choose_voxel_size(sight: Sight | None, detail: Detail = "auto") -> float:
-    """Edge of the surface's voxels [m]: for auto that of a room, or less where everything is nearer;
-    half and twice that for fine and coarse. None is a room.
+    """Edge of the surface's voxels [m]: for auto that of a room, less where everything is nearer, more in a
+    hall whose pixels are coarse; half and twice that for fine and coarse. None is a room.
     """
     size = ROOM
     if sight is not None:
         fits = max(AT_ONE_METRE * sight.depth**EXPONENT, PIXELS * sight.footprint)
         size = min(STEPS, key=lambda step: abs(np.log(step / fits)))
+        if sight.depth > HALL:
+            least = PIXELS_OF_HALL * sight.footprint
+            size = next((step for step in STEPS_OF_HALL if step >= least), STEPS_OF_HALL[-1])
     return TIMES[detail] * size
 
 

@@ -44,6 +44,16 @@ def test_sizes_grow_with_distance_and_are_few():
     assert sizes == sorted(sizes) and set(sizes) <= set(STEPS)
 
 
+@pytest.mark.parametrize(
+    ("distance", "width", "size"),
+    [(8.4, 640, 0.05), (8.4, 320, 0.1), (8.4, 160, 0.2), (14.0, 640, 0.1), (4.9, 160, 0.05)],
+)
+def test_voxels_of_a_hall_span_some_pixels_and_those_of_a_room_stay(distance, width, size):
+    f = 575 / 640 * width
+    camera = PinholeCamera(width, width * 3 // 4, f, f, width / 2 - 0.5, width * 3 / 8 - 0.5)
+    assert choose_voxel_size(sight_of([wall(distance, camera)], 0.1, 20)) == size
+
+
 def test_coarse_pixels_take_larger_voxels():
     assert choose_voxel_size(sight_of([wall(0.4, CAMERA)], 0.1, 5)) == ROOM
 
