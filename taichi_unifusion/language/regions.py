@@ -101,8 +101,9 @@ def join_pieces(
     low = np.array([points[piece].min(axis=0) for piece in pieces]) - distance / 2
     high = np.array([points[piece].max(axis=0) for piece in pieces]) + distance / 2
     trees = [KDTree(points[piece]) for piece in pieces]
-    links, everything = [], None
-    for a, b in zip(*_boxes_that_meet(low, high), strict=True):
+    links: list[tuple[int, int]] = []
+    everything: KDTree | None = None
+    for a, b in _boxes_that_meet(low, high):
         away, at = trees[a].query(points[pieces[b]], distance_upper_bound=distance)
         near = np.isfinite(away)
         if not near.any():
@@ -110,10 +111,11 @@ def join_pieces(
         if size[[a, b]].min() <= PIECE * size[[a, b]].max():
             links.append((a, b))
             continue
-        first, second = pieces[a][at[near]], pieces[b][near]
+        first, second = pieces[a][np.asarray(at)[near]], pieces[b][near]
         if (normals[first] * normals[second]).sum(axis=1).mean() < SAME_WAY:
             continue
-        everything = everything or KDTree(points)
+        if everything is None:
+            everything = KDTree(points)
         between = everything.query((points[first] + points[second]) / 2)[1]
         if (piece_of[between] >= 0).mean() >= 0.5:
             links.append((a, b))
@@ -121,23 +123,22 @@ def join_pieces(
     graph = coo_matrix((np.ones(len(links)), rows), shape=(len(pieces), len(pieces)))
     count, group = connected_components(graph, directed=False)
     return [
-        np.sort(np.concatenate([pieces[i] for i in np.flatnonzero(group == each)]))
+        np.sort(np.concatenate([pieces[i] for i in np.flatnonzero(group == each).tolist()]))
         for each in range(count)
     ]
 
 
-def _boxes_that_meet(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray]:
+def _boxes_that_meet(low: NDArray, high: NDArray) -> list[tuple[int, int]]:
     """Pairs of boxes, each once, that have a point in common; by sweeping along x."""
     order = np.argsort(low[:, 0], kind="stable")
     low, high = low[order], high[order]
-    first, second = [], []
+    pairs: list[tuple[int, int]] = []
     for i in range(len(low)):
         end = int(np.searchsorted(low[:, 0], high[i, 0], "right"))
         later = np.arange(i + 1, end)
         meet = ((low[later] <= high[i]) & (high[later] >= low[i])).all(axis=1)
-        second.append(order[later[meet]])
-        first.append(np.full(int(meet.sum()), order[i]))
-    return np.concatenate(first), np.concatenate(second)
+        pairs += [(int(order[i]), int(j)) for j in order[later[meet]]]
+    return pairs
 
 
 def _connected(mesh: Mesh, inside: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
