@@ -20,6 +20,7 @@ from ..evaluation.viewpoints import Viewpoints
 from ..files.mesh_reading import read_mesh
 from ..files.trajectories import read_trajectory
 from ..geometry.gravity import Up
+from ..tracking.sequence import read_tracked_poses, with_poses
 from ..types import Mesh, Trajectory
 from .outlook import read_up
 from .record import ColorRecord, Source, read_record
@@ -41,10 +42,15 @@ class Run:
 
     @cached_property
     def recording(self) -> Dataset:
-        """The recording that the run read; raises DatasetError where it is no longer there."""
+        """The recording that the run read, with the poses that the run found where it has none of its own;
+        raises DatasetError where it is no longer there.
+        """
         source = self.source
         try:
             opened = open_dataset(source.format, source.path or None, **source.reading)
+            if self.tracked and opened.no_poses and self.folder.tracked_poses.exists():
+                files = self.folder.tracking, self.folder.tracked_poses
+                opened = with_poses(opened, read_tracked_poses(*files))
             return registered_as(opened, source.color)
         except DatasetError as error:
             raise DatasetError(
@@ -99,6 +105,9 @@ class Run:
         these are fitted to the recording's own.
         """
         if not self.tracked:
+            return np.eye(4)
+        if self.recording.no_poses:
+            logger.info("frames are compared where the run found them: errors of poses do not show")
             return np.eye(4)
         tracked, true = match_poses(self.trajectory(), self.true_trajectory())
         T = align_poses(tracked, true)

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from ..datasets import Dataset, DatasetView
 from ..datasets.loading import index_in_recording, load_ahead
-from ..errors import FrameError, PoseError
-from ..files.atomic import write_text
+from ..errors import DatasetError, FrameError, PoseError
+from ..files.atomic import read_bytes, write_text
+from ..files.trajectories import read_trajectory
 from ..types import Frame
 from .base import TrackedFrame, Tracker, TrackingResult, Verdict
 from .external import runs
@@ -170,6 +171,28 @@ def write_tracking(path: Path, result: TrackingResult) -> None:
             ]
         )
     write_text(path, text.getvalue())
+
+
+def read_tracked_poses(table: Path, poses: Path) -> dict[int, NDArray[np.float64]]:
+    """The poses that a run found and wrote, by place in the recording: `poses` has them by time stamp, or
+    by number where a frame had none, and `table` says which frame that is.
+
+    Raises FileError, DatasetError where one is missing or damaged.
+    """
+    rows = list(csv.DictReader(StringIO(read_bytes(table).decode("utf-8", "replace"))))
+    try:
+        numbers = [int(row["frame"]) for row in rows]
+        stamps = [float(row["timestamp"] or "nan") for row in rows]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{table}: not a table of tracked frames ({error})") from None
+    found = read_trajectory(poses)
+    keys = numbers if np.isnan(stamps).any() else stamps
+    place = {float(key): number for key, number in zip(keys, numbers, strict=True)}
+    return {
+        place[float(stamp)]: T
+        for stamp, T in zip(found.timestamps, found.T_world_camera, strict=True)
+        if float(stamp) in place
+    }
 
 
 def _number(value: float | None, form: str) -> str:

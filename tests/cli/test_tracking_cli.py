@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
 from dataset_writers import make_samples, write_replica
-from tiny_recording import FLAGS
+from tiny_recording import FLAGS, write_folder
 
 from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
@@ -105,6 +106,25 @@ def test_every_thins_the_map_and_not_the_tracking(tmp_path):
     np.testing.assert_allclose(
         read_trajectory(tmp_path / "tracking.txt").T_world_camera[::2], mapped
     )
+
+
+def test_frames_left_out_are_compared_at_the_poses_found_where_a_recording_has_none(
+    tmp_path, capsys
+):
+    folder = write_folder(tmp_path / "room", list(SyntheticRoom(width=160, height=120)[:3]))
+    for poses in folder.glob("poses*"):
+        shutil.rmtree(poses) if poses.is_dir() else poses.unlink()
+    words = ["reconstruct", "folder", str(folder), "--every", "2", "--tracking", "rgbd"]
+    assert cli.main([*words, "--out", str(tmp_path / "out"), *FLAGS]) == 0
+    capsys.readouterr()
+    assert cli.main(["evaluate", "rendering", str(tmp_path / "out"), "--json"]) == 0
+    told = capsys.readouterr()
+    score = json.loads(told.out)
+    assert "errors of poses do not show" in told.err and score["used_by_the_run"] == []
+    assert score["coverage"] > 0.5 and score["depth_l1_cm"] < 5
+    (tmp_path / "out" / "tracking.csv").write_text("frame,timestamp\nx,y\n")
+    assert cli.main(["evaluate", "rendering", str(tmp_path / "out")]) == 2
+    assert "not a table of tracked frames" in capsys.readouterr().err
 
 
 def test_results_of_tracking_do_not_outlive_it(found, tmp_path):
