@@ -46,7 +46,7 @@ def test_sizes_grow_with_distance_and_are_few():
 
 @pytest.mark.parametrize(
     ("distance", "width", "size"),
-    [(8.4, 640, 0.05), (8.4, 320, 0.1), (8.4, 160, 0.2), (14.0, 640, 0.1), (4.9, 160, 0.05)],
+    [(8.4, 640, 0.1), (8.4, 320, 0.1), (8.4, 160, 0.2), (14.0, 640, 0.15), (4.9, 160, 0.05)],
 )
 def test_voxels_of_a_hall_span_some_pixels_and_those_of_a_room_stay(distance, width, size):
     f = 575 / 640 * width
