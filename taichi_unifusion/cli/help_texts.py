@@ -100,7 +100,7 @@ def _first_settings() -> list[StructFieldSpec]:
             "detail",
             detail,
             "auto",
-            "Voxels that fit what the first frames see, 5 cm in a room and less where all is near (auto), "
+            "Voxels that fit what the first frames see, 5 cm in a room, less where all is near, more in a hall (auto), "
             "half of that (fine) or twice (coarse).",
         ),
         StructFieldSpec(
