@@ -87,8 +87,8 @@ class Config:
     """Every setting of a reconstruction."""
 
     detail: Detail = "auto"
-    """Which voxel sizes. auto: those that fit what the first frames see, 5 cm in a room and less
-    where all is near; fine, coarse: half and twice that.
+    """Which voxel sizes. auto: those that fit what the first frames see, 5 cm in a room, less where all
+    is near and more in a hall; fine, coarse: half and twice that.
     """
     voxel_size: float = 0.0
     """Voxel edge of the surface in metres, with half of it for colour, and other properties in
