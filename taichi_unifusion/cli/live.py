@@ -79,6 +79,10 @@ def reconstruct_live(
     from ..results.lock import lock_folder
     from ..results.writer import prepare_results
 
+    if settings.tracking.depth_bias:
+        raise InputError(
+            "--live: how depth is wrong (--tracking.depth-bias) is known when all frames were seen; leave it out"
+        )
     source = open_source(recording, poses.tracking, live.live_speed)
     folder = prepare_results(output.out)
 

@@ -40,6 +40,10 @@ class TrackingSettings:
     """How many recent keyframes a frame is aligned to; internal tracking uses at least 3."""
     loops: bool = True
     """Recognise places seen before, and distribute the drift over the trajectory."""
+    depth_bias: bool = False
+    """rgbd: find depth that is wrong by its place in the image from views that overlap, and correct it, in the map
+    too.
+    """
     prior_distance: float = 0.10
     """internal: a refinement that moves a pose further than this from the given one, in metres, is
     not trusted ...

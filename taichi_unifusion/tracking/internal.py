@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,7 +56,10 @@ class InternalTracker(Tracker):
     ) -> None:
         self.prior, self.settings = prior, settings or TrackingSettings()
         self.uses_given_poses, self.warnings = prior.uses_given_poses, prior.warnings
-        self.odometry = KeyframeOdometry(self.settings, preprocess or PreprocessSettings())
+        alone = replace(
+            self.settings, depth_bias=False
+        )  # poses are not to leave the given ones for it
+        self.odometry = KeyframeOdometry(alone, preprocess or PreprocessSettings())
         self.T_world_prior: list[NDArray[np.float64]] = []  # of every keyframe, as given
 
     def track(self, frame: Frame) -> TrackedFrame:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .depth_bias import factors, terms
 from .features import Features
 from .pyramid import ReducedFrame, SurfelPyramid, build_pyramid
 
@@ -41,6 +42,16 @@ class Keyframe:
         points = (T_other_self[:3, :3] @ self.points.T + T_other_self[:3, 3:]).T  # in `other`
         q, seen = other.reduced.camera.look_up(other.reduced.inverse, points, NEAR)
         return float((np.abs(points[seen, 2] * q - 1) < SAME_DEPTH).sum() / len(self.points))
+
+
+def corrected_keyframe(keyframe: Keyframe, bias: NDArray[np.float64]) -> Keyframe:
+    """A keyframe as it should have been read."""
+    reduced, features = keyframe.reduced, keyframe.features
+    inverse = reduced.inverse / factors(reduced.camera, bias)
+    factor = 1 + terms(features.camera, features.pixels[:, 0], features.pixels[:, 1]) @ bias
+    points = (features.points * factor[:, None]).astype(np.float32)
+    there = Features(features.descriptors, features.pixels, points, features.camera)
+    return Keyframe(keyframe.index, replace(reduced, inverse=inverse), there)
 
 
 class Keyframes:
@@ -77,6 +88,11 @@ class Keyframes:
         self.islands.append(island)
         self.T_world_keyframe.append(T_world_keyframe)
         return len(self.items) - 1
+
+    def correct(self, bias: NDArray[np.float64]) -> None:
+        """Correct the depth of all keyframes, as `DepthBias` found it to be wrong."""
+        self.items = [corrected_keyframe(each, bias) for each in self.items]
+        self.pyramids.clear()
 
     def same_island(self, number: int, others: range) -> list[int]:
         """Those of `others` that belong to the sub-map of keyframe `number`."""

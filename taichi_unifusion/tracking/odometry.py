@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,13 +15,16 @@ from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
 from .base import CurrentPoses, TrackedFrame, TrackingResult, TrackingSettings, Verdict
+from .depth_bias import DepthBias
 from .features import Features, extract_features
 from .keyframes import Keyframe, Keyframes
-from .loop_closure import find_loops, neighbor_edges
+from .loop_closure import believable, find_loops, neighbor_edges
 from .pose_graph import ANCHOR, Edge, Prior, optimize
 from .pyramid import ReducedFrame, SurfelPyramid, build_pyramid, reduce_frame
-from .registration import Registration, Target
+from .registration import Registration, Target, register
 from .static_part import MOST_MOVING, SOME_MOVING, register_static, without_left_out
+
+logger = logging.getLogger(__name__)
 
 MIN_SURFELS = 0.03  # smallest share of the image with usable depth that can be aligned
 # An alignment of a frame to its keyframe is trusted from these shares on: of the frame that meets
@@ -32,6 +36,10 @@ FEW_MOVING, LEAST_AGREEMENT = 0.03, 0.5
 # [m, rad] farther from where the camera was expected, little may contradict
 JUMP = 0.1, np.radians(7)
 FRAME_CORRECTION = 0.3, np.radians(20)  # [m, rad] a result farther from its guess is wrong
+ROUNDS = 2  # of correcting depth and aligning keyframes anew
+BIASED = (
+    "tracking: depth is off by up to %.1f%% of itself, by its place in the image, and is corrected"
+)
 NOT_MET = "in a second map, begun where the camera was lost, which has not met the first yet"
 NEVER_MET = "in a second map, begun where the camera was lost, which never surely met the first"
 
@@ -83,10 +91,12 @@ class KeyframeOdometry:
         self.placements: list[Placement] = []
         self.reference = 0  # number of the keyframe that frames are aligned to
         self.optimizations = 0
+        self.bias = DepthBias()
         self.version = version  # grows when the poses of earlier frames change
 
     def prepare(self, frame: Frame) -> PreparedFrame:
-        """Build the frame's pyramid."""
+        """Build the frame's pyramid, of depth that is corrected where it is known to be wrong."""
+        frame = self.bias.corrected(frame)
         reduced = reduce_frame(frame, *self.depth_range)
         return PreparedFrame(frame, reduced, build_pyramid(reduced), self.depth_range)
 
@@ -176,6 +186,8 @@ class KeyframeOdometry:
         """Add edges from a new keyframe to recent ones, and to older ones that close a loop."""
         weight = self.settings.photometric_weight
         self.edges += neighbor_edges(self.keyframes, number, weight)
+        if self.settings.depth_bias:
+            self._look_for_bias(number)
         if not self.settings.loops:
             return
         loops = find_loops(self.keyframes, number, weight, by_appearance)
@@ -183,6 +195,38 @@ class KeyframeOdometry:
         if any(edge.contradicts(self.keyframes.T_world_keyframe) for edge in loops):
             # at once: loops of the next keyframes are looked for from the corrected poses
             self.optimize()
+
+    def _look_for_bias(self, number: int) -> None:
+        """Take in what the edges of a new keyframe say of depth that is wrong by its place in the image. Once
+        that is sure, correct it: of all keyframes, which are aligned anew, and of frames to come.
+        """
+        for edge in self.edges:
+            if edge.b == number and self.bias.looking:
+                self._add_pair(edge)
+        if (more := self.bias.surely()) is None:
+            return
+        for _ in range(ROUNDS):
+            self.bias.correct(more)
+            self.keyframes.correct(more)
+            self.edges = [self._again(edge) for edge in self.edges]
+            for edge in self.edges:
+                self._add_pair(edge)
+            more = self.bias.likeliest
+        self.bias.correct(np.zeros_like(more))
+        logger.warning(BIASED, 100 * self.bias.largest)
+        self.optimize()
+
+    def _add_pair(self, edge: Edge) -> None:
+        source, target = self.keyframes.pyramid(edge.b), self.keyframes.pyramid(edge.a)
+        self.bias.add(source, target, edge.T_a_b)
+
+    def _again(self, edge: Edge) -> Edge:
+        """An edge after depth was corrected; as it was, where its alignment is not sure any more."""
+        source, target = self.keyframes.pyramid(edge.b), self.keyframes.pyramid(edge.a)
+        found = register(source, target, edge.T_a_b, self.settings.photometric_weight)
+        if edge.robust and not believable(found, edge.T_a_b):
+            return edge
+        return Edge.of(edge.a, edge.b, found, robust=edge.robust, loop=edge.loop)
 
     def optimize(self) -> None:
         """Move the keyframes to the poses that fit all edges and priors best."""
@@ -280,6 +324,7 @@ class KeyframeOdometry:
             "loops": len(loops),
             "optimizations": self.optimizations,
             **({"islands": apart} if apart else {}),
+            **({"depth_bias": self.bias.known.tolist()} if self.bias.known.any() else {}),
         }
         return TrackingResult(tuple(frames), tuple(indices), loops, {**counts, **(details or {})})
 

@@ -21,6 +21,7 @@ from ..files.atomic import read_bytes, write_text
 from ..files.trajectories import read_trajectory
 from ..types import Frame
 from .base import TrackedFrame, Tracker, TrackingResult, Verdict
+from .depth_bias import corrected
 from .external import runs
 
 if TYPE_CHECKING:
@@ -114,8 +115,8 @@ def _shortened(where: list[str], most: int = 8) -> str:
 
 
 class PosedFrames(DatasetView):
-    """The frames of a sequence with the poses of `tracking`; a frame without one raises PoseError
-    that says why.
+    """The frames of a sequence with the poses of `tracking`, and with their depth corrected if it was for
+    these; a frame without one raises PoseError that says why.
     """
 
     def __init__(self, sequence: Dataset, tracking: TrackingResult) -> None:
@@ -127,6 +128,8 @@ class PosedFrames(DatasetView):
         frame, tracked = super().load(index), self.tracking.frames[index]
         if tracked.T_world_camera is None:
             raise PoseError(f"{frame.label}: {tracked.verdict}, {tracked.message}")
+        if "depth_bias" in self.tracking.details:
+            frame = corrected(frame, np.array(self.tracking.details["depth_bias"], np.float64))
         return replace(frame, T_world_camera=tracked.T_world_camera)
 
     def pose_at(self, index: int) -> tuple[float | None, NDArray[np.float64] | None]:
