@@ -127,7 +127,7 @@ def map_in_one_pass(recording: Dataset, made: Run) -> Mapped:
     if pipeline.follower is not None and not watched:  # nobody sees the map before its end
         pipeline.follower.budget = 0.0
     frames = OnlineFrames(recording, tracker, options.recording.every, following(pipeline))
-    logger.info("tracking: %s, in one pass with mapping", poses.tracking)
+    logger.info("tracking: %s, in one pass with mapping", poses.mode)
     warnings = say_warnings(frames.frames, tracker)
     strict = options.recording.strict
     run = map_frames(
@@ -142,7 +142,7 @@ def map_in_one_pass(recording: Dataset, made: Run) -> Mapped:
     write_trajectory(folder.tracked_poses, result.trajectory)
     assert pipeline.follower is not None
     details = {
-        "mode": poses.tracking,
+        "mode": poses.mode,
         **result.details,
         "passes": 1,
         "following": {
@@ -161,7 +161,7 @@ def _tracker(options: RunOptions) -> Any:
 
     poses, settings = options.poses, options.settings
     return make_tracker(
-        poses.tracking,
+        poses.mode,
         settings.tracking,
         settings.preprocess,
         trajectory=poses.trajectory,

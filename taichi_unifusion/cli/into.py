@@ -212,7 +212,7 @@ def _found(
         known,
         new,
         settings.tracking.photometric_weight,
-        rigid=options.poses.tracking in POSED,
+        rigid=options.poses.mode in POSED,
     )
     logger.info("%s", sentence(joined, len(new)))
     motion = joined.T_known_keyframe @ se3.inverse(np.array(new.T_world_keyframe))

@@ -83,7 +83,7 @@ def reconstruct_live(
         raise InputError(
             "--live: how depth is wrong (--tracking.depth-bias) is known when all frames were seen; leave it out"
         )
-    source = open_source(recording, poses.tracking, live.live_speed)
+    source = open_source(recording, poses, live.live_speed)
     folder = prepare_results(output.out)
 
     def map_and_write(watcher: Watcher, stop: Callable[[], bool]) -> int:
@@ -97,8 +97,9 @@ def reconstruct_live(
         return run_watched(watch, folder, source.most or 0, map_and_write)
 
 
-def open_source(asked: RecordingOptions, mode: Mode, speed: float) -> LiveSource:
+def open_source(asked: RecordingOptions, poses: TrackingOptions, speed: float) -> LiveSource:
     """The camera, or the recording to be played; InputError for options that do not go together."""
+    mode = poses.mode
     if asked.path is None and asked.format in CAMERAS:
         if asked.start or asked.every != 1:
             raise InputError(
@@ -111,6 +112,7 @@ def open_source(asked: RecordingOptions, mode: Mode, speed: float) -> LiveSource
         camera = RealsenseCamera(align=_align(asked))
         return LiveSource(camera, asked.format, "rgbd", None, asked.end)
     recording = open_recording(asked)
+    mode = poses.for_recording(recording).mode
     if mode not in ("given", "rgbd"):
         raise InputError(f"--live: poses are given or found by rgbd, not by --tracking {mode}")
     check_poses(recording, mode)

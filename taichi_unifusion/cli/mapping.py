@@ -112,7 +112,7 @@ def _track(recording: Dataset, run: Run) -> tuple[PosedFrames, Mapping[str, Any]
     options, saver = run.options, run.saver
     if saver.tracked is not None:
         posed = PosedFrames(recording, saver.tracked)
-        return posed, {"mode": options.poses.tracking, **posed.tracking.details}
+        return posed, {"mode": options.poses.mode, **posed.tracking.details}
     poses, settings = options.poses, options.settings
     runtime.init(settings.device, threads=settings.threads or None)
     with frame_progress(len(recording)) as on_frame:
@@ -120,7 +120,7 @@ def _track(recording: Dataset, run: Run) -> tuple[PosedFrames, Mapping[str, Any]
             recording,
             settings.tracking,
             settings.preprocess,
-            mode=poses.tracking,
+            mode=poses.mode,
             trajectory=poses.trajectory,
             interpolate=poses.interpolate,
             body_camera=poses.body_camera,
@@ -132,4 +132,4 @@ def _track(recording: Dataset, run: Run) -> tuple[PosedFrames, Mapping[str, Any]
         keep_tracking(run.folder, posed.tracking)
     if not posed.tracking.interrupted:
         saver.save_tracking(posed.tracking)
-    return posed, {"mode": poses.tracking, **posed.tracking.details}
+    return posed, {"mode": poses.mode, **posed.tracking.details}

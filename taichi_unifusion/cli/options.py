@@ -6,7 +6,8 @@ A command nests them, with `name=""` so that their flags have no prefix.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
@@ -30,6 +31,7 @@ from ..results.record import ColorRecord, Source
 from ..tracking import Mode
 from .color_camera import AUTO, ColorChoice
 
+logger = logging.getLogger(__name__)
 FORMAT_DEFAULT = "(default: the format's)"
 OPTIONAL = "(optional)"
 
@@ -133,7 +135,12 @@ class RecordingOptions:
 class TrackingOptions:
     """Where camera poses come from."""
 
-    tracking: Mode = "given"
+    tracking: Annotated[
+        Mode | None,
+        arg(
+            help_behavior_hint="(default: given; rgbd for a sensor's file without poses beside it)"
+        ),
+    ] = None
     """Camera poses. given: the recording's; external: from --trajectory; internal: either of them,
     refined; rgbd: from the frames alone."""
     trajectory: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=OPTIONAL)] = None
@@ -152,7 +159,24 @@ class TrackingOptions:
     @property
     def tracked(self) -> bool:
         """Whether poses come from elsewhere than the recording, or are meant to."""
-        return self.tracking != "given" or self.trajectory is not None or self.interpolate
+        return self.mode != "given" or self.trajectory is not None or self.interpolate
+
+    @property
+    def mode(self) -> Mode:
+        """What was asked for, else the recording's poses."""
+        return self.tracking or "given"
+
+    def for_recording(self, recording: Dataset) -> TrackingOptions:
+        """The same with a mode: a sensor's own file holds no poses, so that they are found from its frames
+        where nothing else was asked for, which is said.
+        """
+        if self.tracking or self.tracked or not recording.sensor_alone:
+            return replace(self, tracking=self.mode)
+        logger.info(
+            "tracking: a sensor's file holds no poses and none lie beside it, so they are found from the frames "
+            "(--tracking given takes what there is)"
+        )
+        return replace(self, tracking="rgbd")
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,8 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     """What every command does that makes maps, of a recording that is open; with an image encoder
     also a map of its features.
     """
-    check_poses(recording, options.poses.tracking, options.poses.trajectory)
+    options = replace(options, poses=options.poses.for_recording(recording))
+    check_poses(recording, options.poses.mode, options.poses.trajectory)
     if options.output.resume and (
         options.output.keep_windows or options.poses.tracking_passes == 1
     ):
@@ -167,11 +168,11 @@ def _map_and_write(recording: Dataset, color: ColorRecord, up: Up | None, made: 
     ended = [error for error in (run.failure, *results.failures) if error]
     code = report(ended)
     end_saving(folder, done=not (run.interrupted or ended))
-    code = _report_missing(run, len(frames)) or code
+    code = _report_missing(run, len(frames), tracked=mapped.tracking is not None) or code
     return INTERRUPTED if made.stop() else code
 
 
-def _report_missing(run: RunResult, frames: int) -> int:
+def _report_missing(run: RunResult, frames: int, *, tracked: bool) -> int:
     """Say how many of the frames are not in the map; FAILED where these are most of those tried."""
     from ..run_log import SKIP_REASONS
 
@@ -183,7 +184,7 @@ def _report_missing(run: RunResult, frames: int) -> int:
         kinds["not reached"] = not_reached
     reasons = ", ".join(f"{count} {reason}" for reason, count in kinds.most_common())
     few = len(run.skipped) >= len(run.steps)
-    unposed = kinds[SKIP_REASONS[PoseError]] > len(run.steps)
+    unposed = not tracked and kinds[SKIP_REASONS[PoseError]] > len(run.steps)
     logger.log(
         logging.ERROR if few else logging.WARNING,
         "%d of %d frames are not in the map: %s%s",

@@ -40,7 +40,7 @@ def open_saver(
         config=dump_config(options.settings),
         recording=source_of(options.recording, frames),
         poses={
-            "tracking": poses.tracking,
+            "tracking": poses.mode,
             "trajectory": str(poses.trajectory or ""),
             "interpolate": poses.interpolate,
             **({"into": str(output.into)} if output.into else {}),
@@ -86,7 +86,7 @@ def is_complete(folder: RunFolder, frames: int, options: RunOptions) -> bool:
         and replace(source, before=()) == asked
         and into == str(options.output.into or "")
         and settled == used
-        and mode == options.poses.tracking
+        and mode == options.poses.mode
         and not (done.interrupted or record.errors)
         and done.used + done.skipped == frames
     )

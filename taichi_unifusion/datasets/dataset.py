@@ -30,6 +30,8 @@ class Dataset(ABC, Sequence[Frame]):
     name: str
     warnings: tuple[str, ...] = ()
     no_poses: str = ""  # why no frame has a pose; empty if some have one
+    # a sensor's own file, whose format has no place for poses, and none lie beside it
+    sensor_alone: bool = False
     # loading launches kernels, and two threads must not launch kernels at once
     runs_kernels: bool = False
     # colour is known to fit depth pixel by pixel: it was rendered, or registered by a calibration
@@ -124,6 +126,7 @@ class DatasetView(Dataset):
         self.dataset, self.indices = dataset, indices
         self.name, self.warnings, self.no_poses = dataset.name, dataset.warnings, dataset.no_poses
         self.registered, self.up = dataset.registered, dataset.up
+        self.sensor_alone = dataset.sensor_alone
 
     def __len__(self) -> int:
         return len(self.indices)

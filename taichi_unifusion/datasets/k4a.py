@@ -9,12 +9,14 @@ the paper does: depth and infrared are carried over). Either way a pixel has dep
 cameras see its point. Infrared becomes the image "infrared", (H, W, 1), in units of 0..65535.
 
 Poses: `NAME.txt` beside `NAME.mkv`, rows `timestamp tx ty tz qx qy qz qw` with the recording's
-seconds, camera-to-world of the camera that is aligned to. Without such a file the first frame's
-camera is the world, and other frames have no pose.
+seconds, camera-to-world of the camera that is aligned to. Without such a file `unifusion reconstruct`
+finds them from the frames (`--tracking rgbd`); given are then the first frame's, whose camera is the
+world, and no others.
 """
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -32,6 +34,7 @@ from ..files.k4a_container import (
     read_contents,
     read_images,
 )
+from ..files.trajectories import Pose
 from ..geometry.time_stamps import check_max_difference, nearest
 from ..types import Frame, PinholeCamera
 from .dataset import Dataset
@@ -101,7 +104,8 @@ class K4aFile(Dataset):
         if known.color is None and COLOR in contents.sizes:
             raise DatasetError(f"{path}: {CALIBRATION} knows no colour camera")
         times = self.unit * np.array([capture.depth for capture in self.captures])
-        self.poses, self.warnings = poses_beside(path, times, max_difference)
+        beside = poses_beside(path, times, max_difference)
+        self.poses, self.warnings, self.sensor_alone = beside.poses, beside.warnings, beside.none
 
     @property
     def camera(self) -> PinholeCamera:
@@ -110,6 +114,14 @@ class K4aFile(Dataset):
 
     def __len__(self) -> int:
         return len(self.captures)
+
+    def without_poses(self) -> K4aFile:
+        bare = copy(self)
+        bare.poses, bare.warnings = tuple(Pose("") for _ in self.poses), ()
+        return bare
+
+    def pose_at(self, index: int) -> tuple[float | None, NDArray[np.float64] | None]:
+        return self.captures[index].depth * self.unit, self.poses[index].usable
 
     def load(self, index: int) -> Frame:
         """Read and register frame `index`; FrameError (PoseError) names the file and the frame."""

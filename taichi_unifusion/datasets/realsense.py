@@ -7,8 +7,8 @@ colour: that is done by the calibration in the file, as for an Azure Kinect, to 
 carried over). Either way a pixel has depth only where both cameras see its point.
 
 Poses: `NAME.txt` beside the recording, rows `timestamp tx ty tz qx qy qz qw` with the recording's seconds,
-camera-to-world of the camera that is aligned to. Without such a file the first frame's camera is the
-world, and other frames have no pose.
+camera-to-world of the camera that is aligned to. Without such a file `unifusion reconstruct` finds them from
+the frames (`--tracking rgbd`); given are then the first frame's, whose camera is the world, and no others.
 """
 
 from __future__ import annotations
@@ -105,8 +105,9 @@ class RealsenseFile(Dataset):
             T_color_depth = color.T_stream_reference @ se3.inverse(depth.T_stream_reference)
         self.rig = SensorRig(depth.lens, color.lens if color else None, T_color_depth, align)
         self.partners = _partners(depth, color)
-        self.poses, beside = poses_beside(bag.path, depth.times, max_difference)
-        self.warnings = (*bag.damage, *beside)
+        beside = poses_beside(bag.path, depth.times, max_difference)
+        self.poses, self.sensor_alone = beside.poses, beside.none
+        self.warnings = (*bag.damage, *beside.warnings)
 
     @property
     def camera(self) -> PinholeCamera:
@@ -118,7 +119,7 @@ class RealsenseFile(Dataset):
 
     def without_poses(self) -> RealsenseFile:
         bare = copy(self)
-        bare.poses = tuple(Pose("") for _ in self.poses)
+        bare.poses, bare.warnings = tuple(Pose("") for _ in self.poses), tuple(self.bag.damage)
         return bare
 
     def pose_at(self, index: int) -> tuple[float | None, NDArray[np.float64] | None]:

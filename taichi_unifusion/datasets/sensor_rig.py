@@ -83,12 +83,18 @@ class SensorRig:
         return depth, color, None if infrared is None else moved
 
 
-def poses_beside(
-    recording: Path, times: NDArray[np.float64], max_difference: float
-) -> tuple[tuple[Pose, ...], tuple[str, ...]]:
+@dataclass(frozen=True)
+class PosesBeside:
+    """Poses of a sensor's recording, which has no place for them itself."""
+
+    poses: tuple[Pose, ...]  # of every frame
+    warnings: tuple[str, ...]
+    none: bool  # there is no file of them, and there is more than one frame
+
+
+def poses_beside(recording: Path, times: NDArray[np.float64], max_difference: float) -> PosesBeside:
     """The pose of every frame by its time [s], from rows `timestamp tx ty tz qx qy qz qw` in the text file
-    of the recording's name, and what to say of them. Without that file the first frame is the origin and
-    nothing is known of others.
+    of the recording's name. Without that file the first frame is the origin and nothing is known of others.
     """
     file = recording.with_suffix(".txt")
     if not file.exists():
@@ -97,7 +103,8 @@ def poses_beside(
             f"there is no {file.name} with poses beside {recording.name}: the first frame's "
             "camera is the world, and the other frames have no pose (--tracking rgbd finds them)"
         )
-        return poses, (said,) * (len(times) > 1)
+        several = len(times) > 1
+        return PosesBeside(poses, (said,) * several, several)
     rows = sorted(read_stamped_poses(file), key=lambda row: row.timestamp)
     stamps = np.array([row.timestamp for row in rows])
     nothing = f"no pose within {max_difference} s of the frame"
@@ -107,4 +114,4 @@ def poses_beside(
         else Pose(str(file), problem=nothing)
         for i, time in zip(nearest(stamps, times), times, strict=True)
     )
-    return poses, tuple(pose_warnings(poses))
+    return PosesBeside(poses, tuple(pose_warnings(poses)), False)

@@ -139,7 +139,7 @@ class RgbdTracker(Tracker):
             odometry.reference, found = place
             return self._accept(prepared, found, Verdict.RELOCALISED)
         if sum(placement.keyframe is not None for placement in odometry.placements) == 1:
-            return self._restart(prepared)
+            return self._restart(prepared, problem)
         if (found := self._fits_candidate(prepared)) is not None:
             self._begin_island()
             return self._accept(prepared, found, Verdict.TRACKED)
@@ -166,8 +166,10 @@ class RgbdTracker(Tracker):
         self.seen[0] = self.frames, self.T_world_first
         return self.odometry.place(prepared, Verdict.TRACKED, np.eye(4))
 
-    def _restart(self, prepared: PreparedFrame) -> TrackedFrame:
-        """Start over here: no frame could be aligned to the first keyframe; its frames become LOST."""
+    def _restart(self, prepared: PreparedFrame, problem: str) -> TrackedFrame:
+        """Start over here: no frame could be aligned to the first keyframe, because of `problem`; its frames
+        become LOST.
+        """
         before = self.odometry
         self.odometry = KeyframeOdometry(self.settings, self.preprocess, before.version + 1)
         for placement in before.placements:
@@ -178,7 +180,7 @@ class RgbdTracker(Tracker):
                     verdict=Verdict.LOST,
                     T_world_camera=None,
                     keyframe=None,
-                    message="no other frame fits it",
+                    message=f"no other frame fits it: {problem}",
                 )
             self.odometry.placements.append(Placement(lost))
         self._forget()

@@ -9,9 +9,12 @@ import shutil
 import numpy as np
 import pytest
 from dataset_writers import make_samples, write_replica
+from k4a_writer import write_k4a
 from tiny_recording import FLAGS, write_folder
 
 from taichi_unifusion.cli import main as cli
+from taichi_unifusion.cli.options import TrackingOptions
+from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
 from taichi_unifusion.geometry import se3
@@ -181,3 +184,22 @@ def test_S2_a_recording_without_poses_is_one_sentence_that_says_what_is_missing(
 def test_V4_options_that_make_no_sense(options, told, tmp_path, capsys):
     assert cli.main([*FEW, *options, "--out", str(tmp_path / "out")]) == 2
     assert told in " ".join(capsys.readouterr().err.replace("│", " ").split())
+
+
+def test_of_a_sensors_file_without_poses_they_are_found_from_the_frames(tmp_path, caplog):
+    """Its format has no place for poses, so nothing is wrong there; of others their lack is told."""
+    pytest.importorskip(
+        "av", reason="recordings of an Azure Kinect are read with PyAV, extra 'k4a'"
+    )
+    file = write_k4a(tmp_path / "walk.mkv")
+    recording = open_dataset("k4a", file)
+    with caplog.at_level("INFO"):
+        assert TrackingOptions().for_recording(recording).mode == "rgbd"
+    assert "a sensor's file holds no poses" in caplog.text
+    assert TrackingOptions().for_recording(recording[1:]).tracked
+    assert TrackingOptions("given").for_recording(recording).mode == "given"
+    assert TrackingOptions().for_recording(SyntheticRoom()).mode == "given"
+    bare = recording.without_poses()
+    assert bare.warnings == () and all(frame.T_world_camera is None for frame in bare)
+    file.with_suffix(".txt").write_text("0.463 1 2 3 0 0 0 1\n")
+    assert not TrackingOptions().for_recording(open_dataset("k4a", file)).tracked

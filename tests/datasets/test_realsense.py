@@ -59,8 +59,11 @@ def test_poses_beside_the_recording(tmp_path):
     dataset = open_dataset("realsense", path)
     np.testing.assert_array_equal(dataset[0].T_world_camera, np.eye(4))
     assert dataset[1].T_world_camera is None and "no r.txt with poses" in dataset.warnings[-1]
+    assert dataset.sensor_alone and dataset[::2].sensor_alone
+    assert dataset.without_poses().warnings == ()
     path.with_suffix(".txt").write_text("0.0333 1 2 3 0 0 0 1\n")
     dataset = open_dataset("realsense", path)
+    assert not dataset.sensor_alone
     np.testing.assert_array_equal(dataset[1].T_world_camera[:3, 3], (1, 2, 3))
     with pytest.raises(FrameError, match="no pose within"):
         dataset[0]
