@@ -114,3 +114,17 @@ def test_c17_normals_of_another_length_are_refused():
             PointCloud(points, normals)
     up[2] = np.nan  # a point without a normal: it is left out when it is fused
     assert len(PointCloud(points, up)) == 3
+
+
+@pytest.mark.parametrize(("cx", "cy"), [(0, 0), (640, 480), (0, 480)])
+def test_images_of_another_size_have_a_camera_wherever_the_principal_point_is(cx, cy):
+    """At the border of the image it moves up to a pixel outside of a smaller or larger one."""
+    camera = PinholeCamera(640, 480, 500.0, 510.0, cx, cy)
+    corner = np.array([0.1, -0.2, 1.0])
+    for other in (camera.resized(80, 60), camera.resized(5120, 3840), camera.shrunk(7)):
+        scale = other.fx / camera.fx
+        expected = scale * (camera.project(corner) + 0.5) - 0.5
+        np.testing.assert_allclose(other.project(corner), expected, rtol=1e-9)
+    assert camera.resized(640, 480) == camera and hash(camera.resized(640, 480)) == hash(camera)
+    with pytest.raises(InputError, match="cannot become 0x0"):
+        camera.shrunk(1000)

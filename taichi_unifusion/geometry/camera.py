@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from numbers import Integral, Real
 
@@ -65,27 +66,33 @@ class PinholeCamera:
     def resized(self, width: int, height: int) -> PinholeCamera:
         """The same camera for the image resampled to width x height (pixel centres at integers)."""
         sx, sy = width / self.width, height / self.height
-        return PinholeCamera(
-            width,
-            height,
-            self.fx * sx,
-            self.fy * sy,
-            (self.cx + 0.5) * sx - 0.5,
-            (self.cy + 0.5) * sy - 0.5,
-        )
+        return self._scaled((width, height), sx, sy)
 
     def shrunk(self, factor: int) -> PinholeCamera:
         """The camera of an image whose pixels are blocks of factor x factor; a remainder at the
         right and below is cut off.
         """
-        return PinholeCamera(
-            self.width // factor,
-            self.height // factor,
-            self.fx / factor,
-            self.fy / factor,
-            (self.cx + 0.5) / factor - 0.5,
-            (self.cy + 0.5) / factor - 0.5,
+        return self._scaled((self.width // factor, self.height // factor), 1 / factor, 1 / factor)
+
+    def _scaled(self, size: tuple[int, int], sx: float, sy: float) -> PinholeCamera:
+        """The camera of the image whose columns and rows are so many times as many. A principal point at
+        the very border, which was taken, may come to lie up to a pixel outside.
+        """
+        scaled = copy(self)
+        values = (
+            *size,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
         )
+        for name, value in zip(NUMBERS, values, strict=True):
+            object.__setattr__(scaled, name, value)
+        if not (min(size) >= 1 and np.isfinite(scaled.intrinsics).all()):
+            raise InputError(
+                f"camera: {self.width}x{self.height} cannot become {size[0]}x{size[1]}"
+            )
+        return scaled
 
     @property
     def longest_ray(self) -> float:
