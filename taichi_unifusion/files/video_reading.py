@@ -46,6 +46,8 @@ class VideoPictures:
                 stamps = {
                     packet.pts for packet in container.demux(stream) if packet.pts is not None
                 }
+        except DatasetError:  # which is a ValueError too
+            raise
         except (FFmpegError, OSError, ValueError) as error:
             raise DatasetError(
                 f"{path}: not a video that can be read ({str(error)[:80]})"

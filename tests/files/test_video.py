@@ -8,8 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from taichi_unifusion.errors import FileError, InputError, MissingDependency
+from taichi_unifusion.errors import DatasetError, FileError, InputError, MissingDependency
 from taichi_unifusion.files.video import check_video, video_writer
+from taichi_unifusion.files.video_reading import VideoPictures
 
 av = pytest.importorskip("av")
 LOSSY = 12  # of 255, in the mean, that coding may change
@@ -59,3 +60,14 @@ def test_what_cannot_be_a_video_is_told_before(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingDependency, match=r"pip install 'taichi-unifusion\[video\]'"):
         check_video(tmp_path / "v.mp4", (64, 48))
+
+
+def test_a_video_of_an_unknown_codec_is_refused(tmp_path):
+    path = tmp_path / "v.mp4"
+    with video_writer(path, (64, 48), 10) as add:
+        add(pictures(1)[0])
+    content = path.read_bytes()
+    at = content.index(b"stsd") + 16  # the name of the first sample entry
+    path.write_bytes(content[:at] + b"zz" + content[at + 2 :])
+    with pytest.raises(DatasetError, match="of a codec that is not known here"):
+        VideoPictures(path)
