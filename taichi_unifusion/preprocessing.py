@@ -162,9 +162,11 @@ def find_patches(
         [0, 0, surface.blocks if surface else 0, color.blocks if color else 0], np.int32
     )
     image = np.ascontiguousarray(frame.color) if color else np.zeros((1, 1, 3), np.uint8)
+    none = np.zeros((1, 1), np.uint8)
     kernels.make_patches(
         inverse,
         image,
+        none if frame.weights is None else np.ascontiguousarray(frame.weights),
         frame.camera.intrinsics,
         T_world_camera[:3],
         settings.normal_radius,
@@ -180,7 +182,12 @@ def find_patches(
             color.stamp if color else 0,
             *targets.first,
         ),
-        kernels.Sinks(write, surface.sink if surface else None, color.sink if color else None),
+        kernels.Sinks(
+            write,
+            surface.sink if surface else None,
+            color.sink if color else None,
+            frame.weights is not None,
+        ),
         totals,
         (surface or _nothing()).keys,
         (surface or _nothing()).sums,
@@ -270,7 +277,7 @@ def _averages(
         return kernels.Values(values, counts)
     image = np.ascontiguousarray(frame.images[name])
     values, known = _rows(name, frame, image.shape[2]), _column(f"{name} known", frame)
-    kernels.average_image(found, places, image, values, known)
+    kernels.average_image(found, places, counts, image, values, known)
     whole = name in frame.carried
     return kernels.Values(values, counts if whole else known, whole)
 

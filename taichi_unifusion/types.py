@@ -79,6 +79,8 @@ class Frame:
     features: Mapping[str, ImageView] = field(default_factory=dict)  # of any size, (h, w, c)
     # its pose lies in a world of its own: it is kept, and fused once its place in the map is known
     apart: bool = False
+    # (H, W) uint8 halves of a pixel that each reading counts in the maps' sums, from 1; None: 2, whole ones
+    weights: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         at = self.label
@@ -112,6 +114,8 @@ class Frame:
                     f"{at}: image '{name}' must be (H, W, c) float32, got {image.shape} {image.dtype}"
                 )
             self._check_size(at, f"image '{name}'", image)
+        if self.weights is not None:
+            self._check_weights(at)
         if self.T_world_camera is not None:
             object.__setattr__(
                 self, "T_world_camera", check_rigid(self.T_world_camera, f"{at}: T_world_camera")
@@ -135,6 +139,16 @@ class Frame:
                 f"{at}: {what} is {image.shape[1]}x{image.shape[0]} but depth is "
                 f"{self.depth.shape[1]}x{self.depth.shape[0]}; register or resize one of them"
             )
+
+    def _check_weights(self, at: str) -> None:
+        check_array(f"{at}: weights", self.weights, FrameError)
+        assert self.weights is not None
+        if self.weights.ndim != 2 or self.weights.dtype != np.uint8 or self.weights.min() < 1:
+            raise FrameError(
+                f"{at}: weights must be (H, W) uint8 of 1 (half a pixel) and more, got {self.weights.shape} "
+                f"{self.weights.dtype} from {self.weights.min()}; what does not count has depth 0"
+            )
+        self._check_size(at, "weights", self.weights)
 
     @cached_property
     def carried(self) -> frozenset[str]:

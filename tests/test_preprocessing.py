@@ -13,7 +13,7 @@ from viewpoints import FINE, rays
 
 from taichi_unifusion import Frame, PinholeCamera, PointCloud, preprocess
 from taichi_unifusion.datasets import open_dataset
-from taichi_unifusion.errors import InputError, PoseError
+from taichi_unifusion.errors import FrameError, InputError, PoseError
 from taichi_unifusion.kernels import images as kernels
 from taichi_unifusion.preprocessing import PreprocessSettings
 
@@ -347,3 +347,22 @@ def test_F3_a_real_frame_has_no_point_where_the_sensor_read_nothing(data):
     cloud = preprocess(frame)
     assert 150_000 < cloud.counts.sum() < 290_000 and cloud.points[:, 2].max() <= 5.0
     assert (np.einsum("ni,ni->n", cloud.normals, cloud.points) < 0).all()
+
+
+def test_pixels_count_by_their_weights():
+    """Of a plane whose left half counts half the points are the same, there of half as many pixels."""
+    frame, settings = plane_frame(tilted(20)), PreprocessSettings(patch_size=1.0)
+    weights = np.full(frame.depth.shape, 2, np.uint8)
+    weights[:, : CAMERA.width // 2] = 1
+    plain, weighed = (
+        preprocess(each, settings) for each in (frame, replace(frame, weights=weights))
+    )
+    np.testing.assert_array_equal(weighed.points, plain.points)
+    left = CAMERA.project(plain.points)[:, 0] < CAMERA.width // 2 - 0.5
+    quads = plain.counts == 4
+    assert quads.mean() > 0.8 and 0.4 < left.mean() < 0.6
+    np.testing.assert_array_equal(weighed.counts[~left], plain.counts[~left])
+    np.testing.assert_array_equal(weighed.counts[left & quads], 2)
+    for wrong in (weights.astype(int), weights[1:], np.zeros_like(weights)):
+        with pytest.raises(FrameError, match="weights"):
+            replace(frame, weights=wrong)

@@ -47,7 +47,7 @@ class Confidence:
     """What becomes of readings that the phone is not sure of."""
 
     least: int = MIDDLE
-    weigh: bool = False  # MIDDLE counts half: every other pixel of it, as on a chessboard
+    weigh: bool = False  # below HIGH counts half
 
     def __post_init__(self) -> None:
         if self.least not in (LOW, MIDDLE, HIGH):
@@ -62,11 +62,13 @@ class Confidence:
             raise SizeMismatch(
                 f"{where}: confidence is {confidence.shape[1]}x{confidence.shape[0]} but depth is {width}x{height}"
             )
-        kept = confidence >= self.least
-        if self.weigh:
-            white = (np.arange(height)[:, None] + np.arange(width)) % 2 == 0
-            kept &= (confidence >= HIGH) | white
-        return np.where(kept, depth, np.float32(0))
+        return np.where(confidence >= self.least, depth, np.float32(0))
+
+    def weights(self, confidence: NDArray[np.uint8] | None) -> NDArray[np.uint8] | None:
+        """Halves of a pixel that each reading counts, as `Frame.weights` has them."""
+        if not self.weigh or confidence is None:
+            return None
+        return np.where(confidence >= HIGH, np.uint8(2), np.uint8(1))
 
 
 class SharedView(Dataset):
@@ -121,15 +123,28 @@ class SharedView(Dataset):
         shot = self.shots[index]
         T_world_camera = shot.pose.checked() if shot.pose else None
         lens, depth = shot.lens(), shot.depth()
-        if shot.confidence is not None:
-            depth = self.confidence.drop(depth, shot.confidence(), shot.name)
+        confidence = None if shot.confidence is None else shot.confidence()
+        if confidence is not None:
+            depth = self.confidence.drop(depth, confidence, shot.name)
+        weights = self.confidence.weights(confidence)
         height, width = depth.shape
         own = resized_lens(lens, width, height, f"{shot.name}: depth")
         camera = own.pinhole.resized(self.detail * width, self.detail * height)
         if any(lens.distortion) or self.detail > 1:
             depth = own.undistort_depth(depth, camera)
+            if weights is not None:
+                weights = np.maximum(own.undistort(weights, camera), np.uint8(1))
         color = None if shot.color is None else _color(shot, lens, camera)
-        frame = Frame(depth, camera, color, T_world_camera, index, shot.timestamp, shot.name)
+        frame = Frame(
+            depth,
+            camera,
+            color,
+            T_world_camera,
+            index,
+            shot.timestamp,
+            shot.name,
+            weights=weights,
+        )
         border = _black_border(color) if self.black_border and color is not None else None
         if color is None or border is None or not border.any():
             return frame

@@ -162,7 +162,7 @@ def add_colors(
     for m in range(n):
         quad = places[m] >> 4
         run += counts[m]
-        mean = patch_color(color, quad // across * 2, quad % across * 2, places[m] & 15, counts[m])
+        mean = patch_color(color, quad // across * 2, quad % across * 2, places[m] & 15)
         total += mean * ti.cast(counts[m], ti.f32)
         if m == n - 1 or blocks[m + 1] != blocks[m] or cells[m + 1] != cells[m]:
             end_run(3, 3, blocks[m], cells[m], run, total, now, sums)
@@ -191,11 +191,22 @@ def end_run(
 
 
 @ti.func
-def patch_color(color: ti.template(), row: ti.i32, column: ti.i32, mask: ti.i32, count: ti.i32):
+def patch_color(color: ti.template(), row: ti.i32, column: ti.i32, mask: ti.i32):
     """Mean colour, in [0, 1], of the pixels of a quad whose bits are in `mask`."""
-    total = ti.Vector([0, 0, 0])
+    count, total = 0, ti.Vector([0, 0, 0])
     for p in range(QUAD):
         if (mask >> p) & 1 != 0:
+            count += 1
             for c in ti.static(range(3)):
                 total[c] += ti.cast(color[row + p // 2, column + p % 2, c], ti.i32)
     return ti.cast(total, ti.f32) * (1.0 / (255.0 * ti.cast(count, ti.f32)))
+
+
+@ti.func
+def whole_pixels(halves: ti.i32, quad: ti.i32, mask: ti.i32) -> ti.i32:
+    """Pixels that so many halves of them are. One that is left over counts in every other patch, as on a
+    chessboard: `quad` is row plus column of the patch's quad, and `mask` has the bits of its pixels.
+    """
+    first = mask & -mask
+    black = quad + ti.cast(first == 2 or first == 4, ti.i32)
+    return (halves + (black & 1)) >> 1

@@ -12,11 +12,19 @@ from typing import Any
 import taichi as ti
 
 from ..runtime import DeviceArray
-from .arrays import Bytes3, Floats2, Floats3, Ints1, Ints2, Sums3
+from .arrays import Bytes2, Bytes3, Floats2, Floats3, Ints1, Ints2, Sums3
 from .camera import Intrinsics, Pose, lift, move, ray, rotate
 from .images import inverse_depth_slope, segment, segments
 from .index import Index
-from .patch_cells import QUAD, add_colors, add_surfels, ask_ahead, find_cells, patch_color
+from .patch_cells import (
+    QUAD,
+    add_colors,
+    add_surfels,
+    ask_ahead,
+    find_cells,
+    patch_color,
+    whole_pixels,
+)
 from .tasks import small_stride
 
 IS_NUMBER = 0x7F800000  # bits of a float, without its sign, below this
@@ -32,7 +40,7 @@ PatchPack = ti.types.argpack(
     found=Ints1,  # (R,) patches in each run
     points=Floats2,  # (R slots, 3) world [m], mean of the pixels
     normals=Floats2,  # (R slots, 3) unit, towards the camera
-    counts=Ints1,  # (R slots,) pixels
+    counts=Ints1,  # (R slots,) pixels, by their weights
     places=Ints1,  # (R slots,) 16 times the quad's number, row by row, plus a bit for each pixel
 )
 
@@ -52,6 +60,7 @@ class Sinks:
     write: bool  # to arrays, for whoever else wants them
     surface: Sink | None = None
     color: Sink | None = None
+    weighted: bool = False  # pixels count by their weights
 
     @property
     def has_surface(self) -> bool:
@@ -157,6 +166,7 @@ def make_patches(
     # in:
     inverse: Floats2,  # (H, W) 1/z [1/m], 0: none
     color: Bytes3,  # (H, W, 3); any image where no map takes colour
+    weights: Bytes2,  # (H, W) halves of a pixel that each counts, 1 and more; any image unless `weighted`
     K: Intrinsics,
     T_world_camera: Pose,
     radius: ti.template(),  # of the window of a normal [pixels]
@@ -202,12 +212,15 @@ def make_patches(
                     if count > 0:
                         if p == QUAD or (q > 0 and (other or q < least)):
                             x = move(T_world_camera, x / ti.cast(count, ti.f32))
-                            for d in ti.static(range(3)):
-                                middles[3 * n + d], facing[3 * n + d] = x[d], normal[d]
-                            sizes[n] = count
-                            marks[n] = (row * across + column) * 16 + mask
-                            n += 1
-                            pixels += count
+                            if ti.static(sinks.weighted):
+                                count = whole_pixels(count, row + column, mask)
+                            if count > 0:
+                                for d in ti.static(range(3)):
+                                    middles[3 * n + d], facing[3 * n + d] = x[d], normal[d]
+                                sizes[n] = count
+                                marks[n] = (row * across + column) * 16 + mask
+                                n += 1
+                                pixels += count
                             count, mask = 0, 0
                             x.fill(0.0)
                     if q > 0:
@@ -225,9 +238,14 @@ def make_patches(
                                 good = cos_max_angle * m.norm() * ray(u, v, K).norm() <= 1.0
                                 normal = -rotate(T_world_camera, m).normalized()
                         if good:
-                            count += 1
                             mask |= 1 << p
-                            x += lift(u, v, 1.0 / q, K)
+                            if ti.static(sinks.weighted):
+                                halves = ti.cast(weights[v, u], ti.i32)
+                                count += halves
+                                x += lift(u, v, 1.0 / q, K) * ti.cast(halves, ti.f32)
+                            else:
+                                count += 1
+                                x += lift(u, v, 1.0 / q, K)
             if ti.static(sinks.has_surface):
                 blocks, cells = ti.Vector([0] * slots), ti.Vector([0] * slots)
                 find_cells(
@@ -290,9 +308,7 @@ def average_color(
         first = part * ti.static(slots_of_run())
         for n in range(first, first + found[part]):
             row, column = (places[n] >> 4) // across * 2, (places[n] >> 4) % across * 2
-            mask = places[n] & 15
-            count = ti.cast(ti.math.popcnt(ti.cast(mask, ti.u32)), ti.i32)
-            mean = patch_color(color, row, column, mask, count)
+            mean = patch_color(color, row, column, places[n] & 15)
             for c in ti.static(range(3)):
                 values[n, c] = mean[c]
 
@@ -302,21 +318,23 @@ def average_image(
     # in:
     found: Ints1,  # (R,)
     places: Ints1,  # (R slots,)
+    sizes: Ints1,  # (R slots,) pixels of each patch, by their weights
     image: Floats3,  # (H, W, c)
     # out:
     values: Floats2,  # (R slots, c) mean of those pixels of a patch whose values are all numbers
-    counts: Ints1,  # (R slots,) how many they are
+    counts: Ints1,  # (R slots,) their share of its pixels
 ):
     across = (image.shape[1] + 1) // 2
     for part in range(found.shape[0]):
         first = part * ti.static(slots_of_run())
         for n in range(first, first + found[part]):
             row, column = (places[n] >> 4) // across * 2, (places[n] >> 4) % across * 2
-            count = 0
+            count, pixels = 0, 0
             for c in range(image.shape[2]):
                 values[n, c] = 0.0
             for p in range(QUAD):
                 if (places[n] >> p) & 1 != 0:
+                    pixels += 1
                     v, u = row + p // 2, column + p % 2
                     finite = True
                     for c in range(image.shape[2]):
@@ -326,6 +344,6 @@ def average_image(
                         count += 1
                         for c in range(image.shape[2]):
                             values[n, c] = values[n, c] + image[v, u, c]
-            counts[n] = count
+            counts[n] = sizes[n] * count // pixels
             for c in range(image.shape[2]):
                 values[n, c] = values[n, c] / ti.max(ti.cast(count, ti.f32), 1.0)

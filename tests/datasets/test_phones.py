@@ -206,12 +206,15 @@ def test_confidence(tmp_path, format):
     for least in known:
         np.testing.assert_array_equal(known[least], confidence >= least)
     np.testing.assert_array_equal(open_dataset(format, path)[0].depth > 0, known[1])
-    weighed = open_dataset(format, path, weigh_confidence=True)[0].depth > 0
-    assert weighed[:, 20:].all() and not weighed[:, :10].any()
-    # of every two by two pixels two are left
-    middle = weighed[:, 10:20]
-    np.testing.assert_array_equal(middle[::2, ::2] + 0 + middle[1::2, ::2], 1)
-    assert middle.mean() == 0.5
+    weighed = open_dataset(format, path, weigh_confidence=True)[0]
+    np.testing.assert_array_equal(weighed.depth > 0, known[1])
+    np.testing.assert_array_equal(weighed.weights[known[1]], confidence[known[1]])
+    assert open_dataset(format, path)[0].weights is None
+    fine = open_dataset(format, path, weigh_confidence=True, color_detail=2)[0]
+    seen = fine.depth > 0
+    sure = np.repeat(np.repeat(confidence, 2, 0), 2, 1)
+    inner = seen & ~np.isin(np.arange(seen.shape[1]), (19, 20, 39, 40))  # between two of them
+    np.testing.assert_array_equal(fine.weights[inner], np.maximum(sure, 1)[inner])
     with pytest.raises(InputError, match="min_confidence"):
         open_dataset(format, path, min_confidence=3)
 

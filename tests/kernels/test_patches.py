@@ -18,7 +18,7 @@ POSITION = 2e-6  # [m] float32 at some metres
 def assert_same(found: Found, wanted: list[twin.Patch], T=T) -> None:
     """The same pixels in the same patches, in the same order."""
     assert found.places.tolist() == [patch.place for patch in wanted]
-    assert found.counts.tolist() == [len(patch.pixels) for patch in wanted]
+    assert found.counts.tolist() == [patch.count for patch in wanted]
     assert found.totals.tolist() == [len(wanted), found.counts.sum(), 0, 0]
     positions = [twin.position(patch, T) for patch in wanted]
     np.testing.assert_allclose(found.points, positions, atol=POSITION)
@@ -69,6 +69,31 @@ def test_make_patches_equals_its_twin(size, least):
     if least == 0.6:  # the near wall's pixels are fine, and put together; the far ones are not
         assert (sizes[1] > 100) and (inverse > 0.6).any()
     assert 0.3 < found.totals[1] / inverse.size < 0.95
+
+
+@pytest.mark.parametrize("least", [ALL, NONE], ids=["all", "none"])
+def test_make_patches_equals_its_twin_with_weights(least):
+    inverse, camera = steps(63, 47), camera_of(63, 47)
+    weights = np.random.default_rng(4).integers(1, 4, inverse.shape, dtype=np.uint8)
+    found = make(inverse, camera, least=least, weights=weights)
+    assert_same(found, expected(inverse, camera, least=least, weights=weights))
+    assert len(set(found.counts)) > (1 if least == NONE else 4)
+
+
+def test_whole_pixels_are_half_of_the_halves():
+    """What is left over counts in every other patch: all of those that have half a pixel lie on one
+    colour of a chessboard, and the sums of many are right.
+    """
+    inverse, camera = np.full((48, 64), 0.5), camera_of(64, 48)
+    ones = np.ones(inverse.shape, np.uint8)
+    for least in (ALL, NONE):
+        whole, half = (make(inverse, camera, least=least, weights=w) for w in (2 * ones, ones))
+        plain = make(inverse, camera, least=least)
+        np.testing.assert_array_equal(whole.counts, plain.counts)
+        assert 2 * half.counts.sum() == whole.counts.sum() > 1000
+    v, u = np.transpose([twin.pixels_of(place, 64)[0] for place in half.places])
+    black = (v // 2 + u // 2 + v % 2 + u % 2) % 2 == 1
+    assert black.all() and (half.counts == 1).all()
 
 
 @pytest.mark.parametrize("radius", [1, 3])
@@ -173,8 +198,10 @@ def test_average_color_and_image_equal_their_twins():
     )
     image[:, : width // 2] = np.where(spoilt[:, : width // 2, None], np.nan, 1.0)
     values, counts = np.full((rows, 5), -1, np.float32), np.full(rows, -1, np.int32)
-    kernels.average_image(found.found, found.rows, image, values, counts)
-    wanted, known = twin.average_image(found.places, image)
+    sizes = np.zeros(rows, np.int32)
+    sizes[found.filled] = found.counts
+    kernels.average_image(found.found, found.rows, sizes, image, values, counts)
+    wanted, known = twin.average_image(found.places, found.counts, image)
     np.testing.assert_array_equal(counts[found.filled], known)
     np.testing.assert_allclose(values[found.filled], wanted, atol=3 * UNIT)
     assert (counts[~found.filled] == -1).all() and (values[~found.filled] == -1).all()

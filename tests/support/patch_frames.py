@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import reference_patches as twin
@@ -52,6 +52,7 @@ def make(
     cos_max_angle=STEEP,
     least=ALL,
     color=None,
+    weights=None,
     sinks=WRITE,
     now=(1, 0, 0, 0, 0, 0),
     surface=None,
@@ -68,12 +69,13 @@ def make(
     kernels.make_patches(
         inverse.astype(np.float32),
         np.zeros((1, 1, 3), np.uint8) if color is None else color,
+        np.zeros((1, 1), np.uint8) if weights is None else weights,
         camera.intrinsics,
         T[:3],
         radius,
         (jump, cos_max_angle, least),
         now,
-        sinks,
+        replace(sinks, weighted=weights is not None),
         totals,
         *(surface or nothing()),
         *(colors or nothing()),
@@ -86,10 +88,21 @@ def make(
     return Found(found, **rows, totals=totals - (3, 4, 0, 0), filled=filled, rows=made["places"])
 
 
-def expected(inverse, camera, *, T=T, radius=RADIUS, jump=JUMP, cos_max_angle=STEEP, least=ALL):
+def expected(
+    inverse,
+    camera,
+    *,
+    T=T,
+    radius=RADIUS,
+    jump=JUMP,
+    cos_max_angle=STEEP,
+    least=ALL,
+    weights=None,
+):
     # as the kernel is given them, so that both compare the same numbers
     inverse = inverse.astype(np.float32).astype(float)
-    return twin.make_patches(inverse, camera.intrinsics, T, radius, jump, cos_max_angle, least)
+    settings = radius, jump, cos_max_angle, least
+    return twin.make_patches(inverse, camera.intrinsics, T, *settings, weights)
 
 
 def steps(width: int, height: int) -> np.ndarray:

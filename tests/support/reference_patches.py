@@ -17,6 +17,14 @@ class Patch:
     normal: np.ndarray  # (3,) world
     pixels: list[int] = field(default_factory=list)  # of 0..3 in the quad
     points: list[np.ndarray] = field(default_factory=list)  # (3,) camera [m] of each
+    halves: list[int] = field(default_factory=list)  # of a pixel that each counts
+    black: int = 0  # of its quad, as on a chessboard
+
+    @property
+    def count(self) -> int:
+        """Pixels; half a one that is left over counts in patches whose first pixel is on a black field."""
+        field = self.black + sum(QUAD[self.pixels[0]])
+        return (sum(self.halves) + field % 2) // 2
 
     @property
     def place(self) -> int:
@@ -35,8 +43,8 @@ def clip_and_invert(depth, low, high, farthest):
         return readings, np.where(usable, 1 / readings.astype(float), 0.0)
 
 
-def make_patches(inverse, K, T_world_camera, radius, jump, cos_max_angle, least):
-    """The patches of an image of inverse depths, quad by quad.
+def make_patches(inverse, K, T_world_camera, radius, jump, cos_max_angle, least, weights=None):
+    """The patches of an image of inverse depths, quad by quad, without those that count nothing.
 
     A pixel joins the patch of its quad if it lies on the same surface and is far enough away that
     pixels are coarse (`least`); else it begins another one, where it has a normal.
@@ -63,16 +71,18 @@ def make_patches(inverse, K, T_world_camera, radius, jump, cos_max_angle, least)
                 normal = normal_towards_camera(q, slopes, v, u, *K, cos_max_angle)
                 if normal is not None:
                     patch = Patch(quad, T_world_camera[:3, :3] @ normal)
+                    patch.black = quad // across + quad % across
                     found.append(patch)
             if patch is not None:
                 patch.pixels.append(p)
                 patch.points.append(np.array([(u - cx) / fx, (v - cy) / fy, 1]) / q)
-    return found
+                patch.halves.append(2 if weights is None else int(weights[v, u]))
+    return [patch for patch in found if patch.count]
 
 
 def position(patch, T_world_camera):
     """Mean of a patch's pixels (3,) world [m]."""
-    return transform(np.mean(patch.points, axis=0), T_world_camera)
+    return transform(np.average(patch.points, axis=0, weights=patch.halves), T_world_camera)
 
 
 def pixels_of(place, width):
@@ -93,15 +103,15 @@ def average_color(places, color):
     )
 
 
-def average_image(places, image):
-    """(N, c) mean over the pixels of each place whose values are all finite, and (N,) how many
-    those are; 0 where there is none.
+def average_image(places, sizes, image):
+    """(N, c) mean over the pixels of each place whose values are all finite, and (N,) their share of its
+    size; 0 where there is none.
     """
     values, counts = np.zeros((len(places), image.shape[2])), np.zeros(len(places), int)
     for n, place in enumerate(places):
         seen = [image[at].astype(float) for at in pixels_of(place, image.shape[1])]
         finite = [value for value in seen if np.isfinite(value).all()]
-        counts[n] = len(finite)
+        counts[n] = sizes[n] * len(finite) // len(seen)
         if finite:
             values[n] = np.mean(finite, axis=0)
     return values, counts
