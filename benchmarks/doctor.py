@@ -2,6 +2,7 @@
 
     python benchmarks/doctor.py PATH/data
     python benchmarks/doctor.py PATH/data --cache FOLDER --rows clock focal --only house
+    python benchmarks/doctor.py PATH/data --held-out    other recordings, spoiled in other ways
 
 `PATH/data` holds the shared recordings; what is not there is left out. Printed is a row for each
 spoiling: in how many recordings the right cause was named, in how many nothing at all was said, and in
@@ -26,7 +27,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import yaml
-from doctor_spoilings import SPOILINGS, Frames, Spoiling
+from doctor_spoilings import HELD_OUT, SPOILINGS, Frames, Spoiling
 
 from taichi_unifusion.datasets import Dataset, open_dataset
 from taichi_unifusion.datasets.doctor import Diagnosis, examine
@@ -113,6 +114,34 @@ def recordings(data: Path) -> Iterator[tuple[str, Callable[[], Frames]]]:
         )
 
 
+def held_out(data: Path) -> Iterator[tuple[str, Callable[[], Frames]]]:
+    """Stretches of twenty frames that `recordings` has none of, and two of its formats."""
+    kitchen = data / "7scenes-redkitchen"
+    for start, step in ((0, 1), (110, 2), (240, 2)):
+        yield (
+            f"kitchen, 20 from {start}",
+            lambda start=start, step=step: list(
+                open_dataset("7scenes", kitchen)[start : start + 20 * step : step]
+            ),
+        )
+    yield (
+        "synthetic, 20 from 40",
+        lambda: list(open_dataset("synthetic", frames=200, width=320, height=240, seed=9)[40:60]),
+    )
+    for path, start in (("living", 30), ("tour", 440), ("bedroom", 60)):
+        yield (
+            f"house {path}, 20 from {start}",
+            lambda path=path, start=start: _part_of_house(data, path, slice(start, start + 20), 5),
+        )
+    for format in ("polycam", "rosbag mcap"):
+        yield (
+            f"{format} again",
+            lambda format=format: list(
+                open_dataset(format.partition(" ")[0], data / "formats" / SAMPLES[format])
+            ),
+        )
+
+
 SAMPLES = {
     "record3d": "record3d-r3d/doorhandle8.r3d",
     "record3d exr": "record3d-exr/EXR_RGBD",
@@ -133,16 +162,22 @@ def _some(recording: Dataset, start: int, step: int) -> Frames:
 def _house(data: Path, path: str, third: int) -> Frames:
     from house import trajectory
 
+    start = third * len(trajectory(path)) // 3
+    return _part_of_house(data, path, slice(start, start + MOST), third)
+
+
+def _part_of_house(data: Path, path: str, part: slice, seed: int) -> Frames:
+    from house import trajectory
+
     from taichi_unifusion.types import Trajectory
 
     whole = trajectory(path)
-    part = slice(third * len(whole) // 3, third * len(whole) // 3 + MOST)
     recording = open_dataset(
         "scene",
         data / "aws-small-house" / "house.glb",
         trajectory=Trajectory(whole.timestamps[part], whole.T_world_camera[part]),
         camera=PinholeCamera(320, 240, 287.5, 287.5, 159.5, 119.5),
-        seed=third,
+        seed=seed,
     )
     return list(recording)
 
@@ -229,7 +264,7 @@ def frames_of(name: str, data: Path, cache: Path | None) -> Frames:
     kept = cache / f"{name.replace(' ', '_')}.pickle" if cache else None
     if kept is not None and kept.exists():
         return pickle.loads(kept.read_bytes())  # ours
-    frames = timed(dict(recordings(data))[name]())
+    frames = timed(dict([*recordings(data), *held_out(data)])[name]())
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         kept.write_bytes(pickle.dumps(frames))
@@ -246,7 +281,7 @@ def row_of(name: str, data: Path, cache: Path | None, titles: Sequence[str]) -> 
     plain = frozenset(causes(examined(frames)))
     found: dict[str, Cell] = {}
     for title in titles:
-        spoiling = SPOILINGS.get(title)
+        spoiling = (SPOILINGS | HELD_OUT).get(title)
         if spoiling is None or not applies(spoiling, frames):
             continue
         diagnosis = examined(spoiling.change(frames), spoiling.depth_scale)
@@ -268,9 +303,12 @@ def main() -> None:
     parser.add_argument("--rows", nargs="*", default=[""], help="spoilings whose name begins so")
     parser.add_argument("--cache", type=Path, help="folder that keeps the recordings' frames")
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--held-out", action="store_true", help="what the doctor was not made on")
     options = parser.parse_args()
-    names = [n for n, _ in recordings(options.data) if n.startswith(tuple(options.only))]
-    titles = [t for t in (*SPOILINGS, *ON_DISK) if t.startswith(tuple(options.rows))]
+    known = held_out if options.held_out else recordings
+    ways = HELD_OUT if options.held_out else (*SPOILINGS, *ON_DISK)
+    names = [n for n, _ in known(options.data) if n.startswith(tuple(options.only))]
+    titles = [t for t in ways if t.startswith(tuple(options.rows))]
     started = time.perf_counter()
     rows = []
     task = partial(row_of, data=options.data, cache=options.cache, titles=titles)
@@ -295,7 +333,7 @@ def summarize(rows: Sequence[Row]) -> None:
     print("\n| spoiled by | recordings | right | of these one of two | silent | a wrong cause |")
     print("|---|---|---|---|---|---|")
     total = np.zeros(5, int)
-    for title in (*SPOILINGS, *ON_DISK):
+    for title in (*SPOILINGS, *ON_DISK, *HELD_OUT):
         cells = [row.found[title] for row in rows if title in row.found]
         if not cells:
             continue
