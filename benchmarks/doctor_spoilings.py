@@ -230,7 +230,7 @@ HELD_OUT = {
     "clock 0.5 s late": Spoiling("clock-offset", later(0.5), poses=20, moving=True),
     "clock 0.12 s early": Spoiling("clock-offset", later(-0.12), poses=20, moving=True),
     "intrinsics of three quarters": Spoiling("intrinsics", resized(0.75), poses=0),
-    "intrinsics of three times": Spoiling("intrinsics", resized(3.0), poses=0),
+    "intrinsics of five quarters": Spoiling("intrinsics", resized(1.25), poses=0),
     "focal length times 0.75": Spoiling("intrinsics", resized(0.75, False), moving=True),
     "colour 25 pixels aside": Spoiling("color", beside(25, 0), poses=0),
     "colour 10 pixels above": Spoiling("color", beside(0, -10), poses=0),
