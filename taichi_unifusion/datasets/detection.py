@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 
 from ..errors import DatasetError
+from ..files.sqlite_bag import DAMAGED
 
 MOST_NAMES = 200_000  # of a folder that are looked at
 MOST_INSIDE = 50  # folders within a folder that is no recording itself, where one may be
@@ -239,7 +240,7 @@ def _has_device_topics(place: Place) -> bool:
                 sqlite3.connect(f"{place.path.absolute().as_uri()}?mode=ro", uri=True)
             ) as base:
                 names = base.execute("select name from topics limit 1000").fetchall()
-        except sqlite3.Error:
+        except DAMAGED:
             return False
         return any(str(name).startswith(DEVICE_TOPIC.decode()) for (name,) in names)
     return False

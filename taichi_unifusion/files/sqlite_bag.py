@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from ..errors import DatasetError, FrameError
 from .chunked_bag import BagTopic
 
+# Python decodes SQLite's messages, in which names stand as they are in the file
+DAMAGED = sqlite3.Error, UnicodeDecodeError
 BLOCK = 1 << 30  # bytes of a message; more means a damaged file
 STEPS = 10_000  # of SQLite's program between two looks at how long it searches
 LONGEST_SEARCH = 1_000  # of these from one message to the next; more means a damaged file
@@ -33,7 +35,7 @@ class SqliteBag:
             rows = self._connection.execute(
                 "SELECT id, name, type, serialization_format FROM topics"
             ).fetchall()
-        except sqlite3.Error as error:
+        except DAMAGED as error:
             raise DatasetError(f"{path}: not a readable bag of ROS 2 ({error})") from error
         self.topics: dict[str, BagTopic] = {}
         numbers: dict[int, str] = {}
@@ -74,7 +76,7 @@ class SqliteBag:
                 if len(blob) > BLOCK:
                     raise sqlite3.DatabaseError("too large")
                 return blob.read(len(blob) if count is None else min(count, len(blob)))
-        except sqlite3.Error as error:
+        except DAMAGED as error:
             raise FrameError(
                 f"{self.path}: message {index} of {topic} is damaged or cut off ({error})"
             ) from error
@@ -98,7 +100,7 @@ class SqliteBag:
                     last, step, work = row[0], 0, 0
                     yield row
                 break
-            except sqlite3.Error:
+            except DAMAGED:
                 self.damage = (
                     f"{self.path}: the recording is cut off or damaged; it is read up to there"
                 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -157,3 +159,16 @@ def test_real_recordings_are_found(data, name):
 def test_folders_that_are_no_recordings_are_not_taken_for_one(data, name):
     with pytest.raises(DatasetError, match="no recording itself|no format was recognised"):
         known_format("auto", data(name))
+
+
+@pytest.mark.parametrize("format", ["auto", "rosbag", "realsense"])
+def test_names_in_a_bag_that_are_no_text_are_damage(tmp_path, format):
+    """SQLite repeats them in its messages, which Python decodes."""
+    pytest.importorskip("rosbags", reason="bags are read with rosbags, extra 'ros'")
+    path = tmp_path / "r.db3"
+    with closing(sqlite3.connect(path)) as base, base:
+        base.execute("create table topics (id, name, type, serialization_format)")
+        base.execute("pragma writable_schema=on")
+        base.execute("update sqlite_master set name=cast(x'74b6' as text), sql='create table'")
+    with pytest.raises(DatasetError):
+        open_dataset(format, path)
