@@ -23,8 +23,8 @@ FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.005  # of intensities in [0, 1]
 DAMPING = 1e-9  # times the trace: keeps the equations solvable where a direction is open
 MAX_UNCERTAINTY = 0.05  # [m] of the translation in its weakest direction
 # largest ratio of the translation's uncertainty in its weakest and its best direction; rooms have 2
-# to 6, blank walls 14 to 66
-MAX_AMBIGUITY = 10.0
+# to 6, near and low reliefs up to 11.3, blank walls 14 to 66
+MAX_AMBIGUITY = 12.0
 # errors of neighbouring pixels are correlated: an image counts as this many independent
 # measurements, whatever its size
 INDEPENDENT = 192.0
