@@ -20,6 +20,7 @@ from ..config import Config
 from ..datasets import (
     FORMATS,
     Dataset,
+    american,
     format_options,
     known_format,
     open_dataset,
@@ -34,6 +35,7 @@ from .color_camera import AUTO, ColorChoice
 logger = logging.getLogger(__name__)
 FORMAT_DEFAULT = "(default: the format's)"
 OPTIONAL = "(optional)"
+DETAIL = "color_detail"
 
 
 def _folder(words: list[str]) -> Path:
@@ -277,6 +279,16 @@ def open_recording(options: RecordingOptions) -> Dataset:
     recording = open_dataset(options.kind, options.path, **reading_options(options))
     asked = frames_asked(recording, options.start, options.end, options.every)
     return recording[asked.start : options.end]
+
+
+def for_mapping(options: RecordingOptions) -> RecordingOptions:
+    """The same for who maps: pixels of a phone's depth, beside which colour is large, are divided where
+    they are coarse, unless `color_detail` says otherwise.
+    """
+    given = {american(text.partition("=")[0]) for text in options.option}
+    if DETAIL in given or DETAIL not in format_options(options.kind):
+        return options
+    return replace(options, option=(*options.option, f"{DETAIL}=0"))
 
 
 def source_of(options: RecordingOptions, frames: int, color: ColorRecord | None = None) -> Source:

@@ -28,6 +28,7 @@ from .options import (
     RecordingOptions,
     Settings,
     TrackingOptions,
+    for_mapping,
     open_recording,
 )
 from .replacing import say_what_is_replaced
@@ -88,6 +89,7 @@ def reconstruct(options: Reconstruct) -> int:
             options.live,
             options.settings,
         )
+    options = replace(options, recording=for_mapping(options.recording))
     return fuse(open_recording(options.recording), options)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from .options import open_recording
+from .options import for_mapping, open_recording
 from .reconstruct import Reconstruct, fuse
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ class Understand(Reconstruct):
 
 def understand(options: Understand) -> int:
     """Frames -> maps -> mesh -> results folder."""
+    options = replace(options, recording=for_mapping(options.recording))
     # opened first, so that an unreadable recording is reported before a network is loaded
     recording = open_recording(options.recording)
     choice = options.image_encoder

@@ -64,7 +64,7 @@ SENTENCES = {  # what an option of open_dataset means, the same in every format 
     "camera": "The PinholeCamera of the depth images, instead of the recording's.",
     "camera_topic": "Topic of the depth camera's CameraInfo, instead of the one beside the images.",
     "classes": "The class of each object by name; others are their own class.",
-    "color_detail": "Pixels for each of the depth image's, across and down: 2 and more suit colour maps below 2 cm.",
+    "color_detail": "Pixels for each of the depth image's, across and down; 0: 2 where these span over 6 mm, else 1.",
     "color_topic": "Topic of the colour images, or none; needed where several could be meant.",
     "depth_scale": "Units of the depth images that make a metre.",
     "depth_topic": "Topic of the depth images; needed where several could be meant.",

@@ -1,15 +1,17 @@
 """A recording whose depth and colour images show the same view in different sizes, as a phone's do.
 
 Depth keeps its pixels; each takes the mean of the colour pixels that it covers, of which a phone has
-some fifty. Where maps are so fine that more colours show, pixels can be divided: depth is then
+some fifty. Where pixels are so coarse that a map would show more colours, they can be divided: depth is then
 interpolated within surfaces. Every frame may have a camera of its own, for images of the colour's size.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -23,9 +25,13 @@ from .dataset import Dataset
 from .depth_registration import LensCamera
 from .plausibility import camera_warnings, pose_warnings
 
+logger = logging.getLogger(__name__)
 ARKIT_UP = (0.0, 1.0, 0.0)  # its worlds are levelled
 LOW, MIDDLE, HIGH = 0, 1, 2  # how sure a phone is of a reading
 MOST_DETAIL = 8
+AS_FITS = 0  # detail: by how coarse pixels are
+COARSE = 0.006  # [m] what a pixel spans: a quarter of a voxel of colour of the usual size
+TRIED = 5  # frames that are looked at for that
 BLACK = 4  # of 255; JPEG does not keep black exactly
 
 
@@ -94,9 +100,11 @@ class SharedView(Dataset):
     ) -> None:
         self.black_border, self.up = black_border, up
         self.name, self.shots, self.no_poses = name, tuple(shots), no_poses
-        self.confidence, self.detail = confidence or Confidence(), detail
-        if not 1 <= detail <= MOST_DETAIL:
-            raise InputError(f"color_detail: must be from 1 to {MOST_DETAIL}, got {detail}")
+        self.confidence, self.asked_detail = confidence or Confidence(), detail
+        if not AS_FITS <= detail <= MOST_DETAIL:
+            raise InputError(
+                f"color_detail: must be from 1 to {MOST_DETAIL}, or {AS_FITS} for what fits, got {detail}"
+            )
         self.pose_warnings = (
             (f"{no_poses}, so the frames have no poses",)
             if no_poses
@@ -106,6 +114,33 @@ class SharedView(Dataset):
 
     def __len__(self) -> int:
         return len(self.shots)
+
+    @cached_property
+    def detail(self) -> int:
+        """Pixels for each of the depth image's, across and down, in all frames."""
+        return self.asked_detail or self._fitting_detail()
+
+    def _fitting_detail(self) -> int:
+        """2 where colour is larger and pixels of the first frames are coarse, else 1."""
+        for shot in self.shots[:TRIED]:
+            try:
+                depth, lens = shot.depth(), shot.lens()
+                height, width = depth.shape
+                own = resized_lens(lens, width, height, f"{shot.name}: depth").pinhole
+            except FrameError:
+                continue
+            if not (depth > 0).any():
+                continue
+            span = float(np.median(depth[depth > 0])) / own.fx
+            if span <= COARSE or shot.color is None or lens.pinhole.width < 2 * width:
+                return 1
+            logger.info(
+                "colour: pixels of depth span %.0f mm, so each is divided by two across and down "
+                "(--option color_detail=1 keeps them)",
+                1e3 * span,
+            )
+            return 2
+        return 1
 
     def without_poses(self) -> SharedView:
         """The same frames, their poses left out; so are the warnings about those."""

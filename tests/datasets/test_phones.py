@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,11 @@ import phone_writers
 import pytest
 from phone_writers import View, color_at, views
 
+from taichi_unifusion import PinholeCamera
+from taichi_unifusion.cli.options import RecordingOptions, for_mapping, open_recording
 from taichi_unifusion.datasets import open_dataset
+from taichi_unifusion.datasets.depth_registration import LensCamera
+from taichi_unifusion.datasets.shared_view import SharedView, Shot
 from taichi_unifusion.errors import DatasetError, FrameError, InputError
 
 # [m] of depth that is stored in millimetres, halfway between two, and of poses in text
@@ -227,6 +232,41 @@ def test_more_colors_than_depth(tmp_path):
         exact = phone_writers.depth_of(frame.camera, frame.T_world_camera)
         known = frame.depth > 0
         assert known.mean() > 0.9 and np.abs(frame.depth - exact)[known].max() < 0.001
+
+
+def shot(distance: float, camera: PinholeCamera, color=lambda: np.zeros((4, 4, 3), np.uint8)):
+    """A wall so far away, 256x192 pixels of depth."""
+    depth = np.full((192, 256), distance, np.float32)
+    return Shot("s", lambda: LensCamera(camera, ()), lambda: depth, color)
+
+
+def test_pixels_are_divided_where_they_are_coarse():
+    """Asked for what fits, of a colour image that is larger: where they span over 6 mm, which is 1.2 m away."""
+    phone = PinholeCamera(1920, 1440, 1450, 1450, 960, 720)
+    small = phone.resized(256, 192)
+
+    def chosen(*shots: Shot, detail: int = 0) -> int:
+        return SharedView("phone", shots, detail=detail).detail
+
+    def unreadable():
+        raise FrameError("gone")
+
+    assert [chosen(shot(z, phone)) for z in (0.3, 1.1, 1.3, 4.0)] == [1, 1, 2, 2]
+    assert chosen(shot(4.0, small)) == 1 and chosen(shot(4.0, phone, None)) == 1
+    broken = replace(shot(0.3, phone), depth=unreadable)
+    assert chosen(broken, shot(0.0, phone), shot(4.0, phone), shot(0.3, phone)) == 2
+    assert chosen(shot(0.0, phone)) == 1 and chosen(shot(4.0, phone), detail=1) == 1
+
+
+def test_who_maps_asks_for_what_fits(tmp_path):
+    path = phone_writers.write_r3d(tmp_path, views())
+    asked = for_mapping(RecordingOptions("auto", path))
+    assert open_recording(asked)[0].camera.size == (96, 72)
+    for option in ("color_detail=1", "colour_detail=1"):
+        given = RecordingOptions("record3d", path, option=(option,))
+        assert for_mapping(given) == given and open_recording(given)[0].camera.size == (48, 36)
+    other = RecordingOptions("synthetic")
+    assert for_mapping(other) == other
 
 
 def test_a_frame_that_is_damaged_costs_itself_only(tmp_path):
