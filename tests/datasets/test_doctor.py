@@ -123,3 +123,12 @@ def test_a_jump_of_exposure_to_white_is_found_and_a_slow_change_is_none(frames):
         for i, f in enumerate(frames)
     ]
     assert bench.examined(slow).sound
+
+
+@pytest.mark.parametrize("factor", [0.75, 1.25])
+def test_intrinsics_of_a_resolution_not_far_away_are_found_where_frames_move(frames, factor):
+    """The principal point lies no farther off than a camera's own may, but with the focal length it tells."""
+    (found,) = bench.examined(spoilings.resized(factor)(frames)).findings
+    assert found.cause == "intrinsics"
+    right = frames[0].camera.intrinsics
+    np.testing.assert_allclose(found.fix.recording["intrinsics"], right, rtol=0.02)

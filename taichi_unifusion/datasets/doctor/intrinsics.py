@@ -16,6 +16,8 @@ from .sampling import Sample
 FOCALS = np.geomspace(0.4, 2.5, 19)  # factors of another resolution's intrinsics
 LEAST_FOCAL = 1.12  # factor
 SAME_FACTOR = 0.1  # relative, of the two axes' factors and the focal length's
+# share of the image from which on a principal point may tell of another resolution, if frames agree
+SOMEWHAT_OFF = 0.05
 
 
 def off_centre(sample: Sample) -> Finding | None:
@@ -27,17 +29,25 @@ def off_centre(sample: Sample) -> Finding | None:
     if np.abs(shares - 0.5).max() <= OFF_CENTRE:
         return None
     factors = 0.5 / shares
-    told = (
-        f"the principal point ({camera.cx:g}, {camera.cy:g}) is not near the middle of the "
-        f"{camera.width}x{camera.height} images"
-    )
+    told = _told(camera)
     if abs(factors[0] / factors[1] - 1) > SAME_FACTOR:
         return Finding(
             "intrinsics",
             f"{told}: these are another camera's intrinsics, or of images that were cut",
             "--intrinsics FX,FY,CX,CY of the depth images",
         )
-    factor = round_factor(float(factors.mean()))
+    return _of_images(camera, round_factor(float(factors.mean())), told)
+
+
+def _told(camera: PinholeCamera) -> str:
+    return (
+        f"the principal point ({camera.cx:g}, {camera.cy:g}) is not near the middle of the "
+        f"{camera.width}x{camera.height} images"
+    )
+
+
+def _of_images(camera: PinholeCamera, factor: float, told: str) -> Finding:
+    """That intrinsics have to be multiplied by a factor, and how that was told."""
     mended = times(camera, factor)
     size = f"{round(camera.width / factor)}x{round(camera.height / factor)}"
     return Finding(
@@ -90,9 +100,10 @@ def other_focal(evidence: Evidence, centre: Finding | None) -> list[tuple[Change
         if numbers is None:
             return []
         return [(Change(camera=PinholeCamera(camera.width, camera.height, *numbers)), centre)]
+    named = _other_resolution(evidence, camera)
     best = evidence.best(lambda factor: Change(camera=with_focal(camera, factor)), FOCALS, log=True)
     if max(best, 1 / best) < LEAST_FOCAL:
-        return []
+        return named
     mended = with_focal(camera, best)
     change = Change(camera=mended)
     sentence = (
@@ -100,4 +111,19 @@ def other_focal(evidence: Evidence, centre: Finding | None) -> list[tuple[Change
         "intrinsics are of another camera or resolution"
     )
     fix = Fix({"intrinsics": [float(f"{number:.6g}") for number in mended.intrinsics]})
-    return [(change, Finding("intrinsics", sentence, f"--intrinsics {listed(mended)}", fix))]
+    return [
+        *named,
+        (change, Finding("intrinsics", sentence, f"--intrinsics {listed(mended)}", fix)),
+    ]
+
+
+def _other_resolution(evidence: Evidence, camera: PinholeCamera) -> list[tuple[Change, Finding]]:
+    """The intrinsics of which a principal point tells that lies no farther off than cameras' own may."""
+    factors = 0.5 / np.array([(camera.cx + 0.5) / camera.width, (camera.cy + 0.5) / camera.height])
+    factor = round_factor(float(factors.mean()))
+    if np.ptp(factors) > SAME_FACTOR or abs(0.5 / factor - 0.5) < SOMEWHAT_OFF:
+        return []
+    change = Change(camera=times(camera, factor))
+    return [
+        (change, _of_images(camera, factor, f"{evidence.agreement(change)} and {_told(camera)}"))
+    ]
