@@ -169,7 +169,6 @@ def find_patches(
         none if frame.weights is None else np.ascontiguousarray(frame.weights),
         frame.camera.intrinsics,
         T_world_camera[:3],
-        settings.normal_radius,
         (
             settings.edge_jump,
             float(np.cos(np.radians(settings.max_angle))),
@@ -184,6 +183,7 @@ def find_patches(
         ),
         kernels.Sinks(
             write,
+            settings.normal_radius,
             surface.sink if surface else None,
             color.sink if color else None,
             frame.weights is not None,

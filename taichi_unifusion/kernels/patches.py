@@ -55,9 +55,10 @@ class Sink:
 
 @dataclass(frozen=True)
 class Sinks:
-    """Where patches go, as one compile-time argument."""
+    """How patches are made and where they go, as one compile-time argument."""
 
     write: bool  # to arrays, for whoever else wants them
+    radius: int  # of the window of a normal [pixels]
     surface: Sink | None = None
     color: Sink | None = None
     weighted: bool = False  # pixels count by their weights
@@ -169,7 +170,6 @@ def make_patches(
     weights: Bytes2,  # (H, W) halves of a pixel that each counts, 1 and more; any image unless `weighted`
     K: Intrinsics,
     T_world_camera: Pose,
-    radius: ti.template(),  # of the window of a normal [pixels]
     rules: Rules,
     now: Now,
     # in and out:
@@ -227,7 +227,7 @@ def make_patches(
                         if other or not known:
                             of = q
                             slope_u, slope_v, known = inverse_depth_slope(
-                                inverse, v, u, radius, jump
+                                inverse, v, u, ti.static(sinks.radius), jump
                             )
                         good = count > 0
                         if not good:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import reference
 import reference_patches as twin
-from patch_frames import Found, T, camera_of, make, steps
+from patch_frames import RADIUS, Found, T, camera_of, make, steps
 from viewpoints import pose
 
 from taichi_unifusion.kernels import patches as kernels
@@ -45,7 +45,7 @@ class Cells:
             kernels.Sink(grid.index, 1 / size)
             for grid, size in zip(self.grids, VOXELS, strict=True)
         )
-        self.sinks = kernels.Sinks(True, surface, color)
+        self.sinks = kernels.Sinks(True, RADIUS, surface, color)
         self.blocks = (0, 0)
 
     def add(self, inverse, camera, color, *, frame=FRAME, sign=1, first=(0, 0), T=T) -> Found:

@@ -15,7 +15,7 @@ from taichi_unifusion.kernels import patches as kernels
 T = pose((0.3, -1.2, 2.0), 0.4, -0.3, 1.0)
 RADIUS, JUMP = 2, 0.03
 STEEP = float(np.cos(np.radians(80)))
-WRITE = kernels.Sinks(write=True)
+WRITE = kernels.Sinks(write=True, radius=RADIUS)
 ALL, NONE = 0.0, float("inf")  # `least` that puts all pixels of a quad together, or none
 
 
@@ -72,10 +72,9 @@ def make(
         np.zeros((1, 1), np.uint8) if weights is None else weights,
         camera.intrinsics,
         T[:3],
-        radius,
         (jump, cos_max_angle, least),
         now,
-        replace(sinks, weighted=weights is not None),
+        replace(sinks, weighted=weights is not None, radius=radius),
         totals,
         *(surface or nothing()),
         *(colors or nothing()),
