@@ -132,3 +132,9 @@ def test_intrinsics_of_a_resolution_not_far_away_are_found_where_frames_move(fra
     assert found.cause == "intrinsics"
     right = frames[0].camera.intrinsics
     np.testing.assert_allclose(found.fix.recording["intrinsics"], right, rtol=0.02)
+
+
+def test_edges_that_agree_best_where_the_search_ends_tell_nothing():
+    """Textures of this stretch, whose colour fits, agree the better the farther colour is moved."""
+    room = SyntheticRoom(frames=200, width=320, height=240, seed=9)
+    assert find_shift(room[40:60:2]) is None

@@ -68,6 +68,8 @@ def find_shift(frames: Sequence[Frame]) -> tuple[float, float] | None:
     v, u = np.unravel_index(int(mean.argmax()), mean.shape)
     if np.hypot(u - REACH, v - REACH) <= NEAR:
         return None
+    if max(abs(u - REACH), abs(v - REACH)) == REACH:  # still rising where the search ends: no peak
+        return None
     near = slice(REACH - NEAR, REACH + NEAR + 1)
     gain = mean[v, u] - mean[near, near].max()
     frames_gain = [(total[:, v, u] - total[:, REACH, REACH]).sum() > 0 for _, total in told]
