@@ -227,7 +227,7 @@ HELD_OUT = {
     "w first, world to camera": Spoiling(
         "pose-reading", by_pose(lambda T: w_first(np.linalg.inv(T))), moving=True
     ),
-    "clock 0.5 s late": Spoiling("clock-offset", later(0.5), poses=20, moving=True),
+    "clock 0.15 s late": Spoiling("clock-offset", later(0.15), poses=20, moving=True),
     "clock 0.12 s early": Spoiling("clock-offset", later(-0.12), poses=20, moving=True),
     "intrinsics of three quarters": Spoiling("intrinsics", resized(0.75), poses=0),
     "intrinsics of five quarters": Spoiling("intrinsics", resized(1.25), poses=0),
@@ -236,6 +236,6 @@ HELD_OUT = {
     "colour 10 pixels above": Spoiling("color", beside(0, -10), poses=0),
     "far plane 1000 m": Spoiling("far-plane", far_plane(1000.0), poses=0),
     "far plane 40 m": Spoiling("far-plane", far_plane(40.0), poses=0),
-    "a stretch in reverse": Spoiling("swapped", neighbors_exchanged, poses=8, moving=True),
+    "a stretch in reverse": Spoiling("poses", neighbors_exchanged, poses=8, moving=True),
     "exposure times 0.6": Spoiling("exposure", brighter(0.6, 0.3), poses=4),
 }
