@@ -23,6 +23,9 @@ from taichi_unifusion.cli import main as cli
 from taichi_unifusion.datasets import open_dataset
 from taichi_unifusion.datasets.doctor import CAUSES, Fix, examine
 from taichi_unifusion.datasets.doctor.color import find_shift
+from taichi_unifusion.datasets.doctor.evidence import Change, Evidence
+from taichi_unifusion.datasets.doctor.order import misfits
+from taichi_unifusion.datasets.doctor.sampling import take_sample
 from taichi_unifusion.datasets.pose_readings import FLIP_YZ
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 
@@ -138,3 +141,16 @@ def test_edges_that_agree_best_where_the_search_ends_tell_nothing():
     """Textures of this stretch, whose colour fits, agree the better the farther colour is moved."""
     room = SyntheticRoom(frames=200, width=320, height=240, seed=9)
     assert find_shift(room[40:60:2]) is None
+
+
+def test_frames_are_not_out_of_place_where_the_named_change_mends_them(frames):
+    """What poses in another unit say of one frame is chance; pictures in each other's place stay so."""
+
+    def misfit(spoiled, change: Change) -> bool:
+        sample = take_sample(bench.InMemory(spoiled))
+        pairs, _ = sample.pose_pairs()
+        return misfits(Evidence(sample, pairs, []), change, [3, 9])
+
+    inches = spoilings.longer(39.37)(frames)
+    assert misfit(inches, Change()) and not misfit(inches, Change(scale=1 / 39.37))
+    assert misfit(spoilings.exchanged(frames), Change()) and not misfit(frames, Change())

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..pose_fit import EARLY_STEP, MIN_MOTION, PosePairs, View, compare
+from .evidence import Change, Evidence
 from .finding import Finding
 from .sampling import Sample
 
@@ -37,6 +38,21 @@ def swapped_frames(sample: Sample) -> tuple[list[int], list[Finding]]:
         sentence = f"{said} not fit between neighbours, which fit each other: {numbers}"
     advice = "put them in order, or leave them out; check names that were sorted as text"
     return out, [Finding("swapped", sentence, advice)]
+
+
+def misfits(evidence: Evidence, change: Change, misplaced: Sequence[int]) -> bool:
+    """Whether a frame that is out of place is so with a change, too, by which all others agree; what poses
+    that are wrong say of one is chance.
+    """
+    frames = evidence.sample.frames
+    for i in misplaced:
+        around = [j for j in (i - 1, i + 1) if 0 <= j < len(frames) and j not in misplaced]
+        beside = [frames[j] for j in around if frames[j].T_world_camera is not None]
+        pairs = PosePairs([frames[i], *beside], [(0, k + 1) for k in range(len(beside))])
+        fits = [] if change.offset else evidence.fits(change, pairs)
+        if not fits or max(fit.share for fit in fits) < OUTLIER:
+            return True
+    return False
 
 
 def _misplaced(sample: Sample, chains: list[list[int]]) -> list[int]:

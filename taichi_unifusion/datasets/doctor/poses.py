@@ -28,7 +28,7 @@ from .evidence import RIVAL, Change, Evidence
 from .finding import Finding
 from .fix import Fix
 from .intrinsics import off_centre, other_focal
-from .order import swapped_frames
+from .order import misfits, swapped_frames
 from .sampling import Sample
 
 OFFSETS = np.arange(-1.04, 1.05, 0.08)  # [s] that clocks may be apart
@@ -51,7 +51,11 @@ def pose_findings(sample: Sample) -> list[Finding]:
     verdict = judge_poses(pairs, thorough=True)
     named = _named(evidence, verdict, centre)
     if named:
-        return [_with_rivals(evidence, named), *said]
+        change = min((change for change, _ in named), key=evidence.remaining)
+        return [
+            _with_rivals(evidence, named),
+            *(said if misfits(evidence, change, misplaced) else []),
+        ]
     if centre is not None:
         return [centre, *said]
     if not said and verdict.given.share < POOR_SHARE and verdict.given.compared >= MIN_OVERLAP:
