@@ -236,6 +236,6 @@ HELD_OUT = {
     "colour 10 pixels above": Spoiling("color", beside(0, -10), poses=0),
     "far plane 1000 m": Spoiling("far-plane", far_plane(1000.0), poses=0),
     "far plane 40 m": Spoiling("far-plane", far_plane(40.0), poses=0),
-    "a stretch in reverse": Spoiling("poses", neighbors_exchanged, poses=8, moving=True),
+    "a stretch in reverse": Spoiling("swapped", neighbors_exchanged, poses=8, moving=True),
     "exposure times 0.6": Spoiling("exposure", brighter(0.6, 0.3), poses=4),
 }
