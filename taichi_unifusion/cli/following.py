@@ -37,7 +37,7 @@ def in_one_pass(recording: Dataset, options: RunOptions) -> bool:
     obstacle = _obstacle(options.settings)
     if options.output.into is not None:
         obstacle = "the place of the recording in the map (--into) is found from all frames"
-    if options.settings.tracking.depth_bias:
+    if options.settings.tracking.depth_bias == "correct":
         obstacle = "how depth is wrong (--tracking.depth-bias) is known when all frames were seen"
     if options.recording.color_camera == AUTO and not recording.registered:
         obstacle = (

@@ -79,7 +79,7 @@ def reconstruct_live(
     from ..results.lock import lock_folder
     from ..results.writer import prepare_results
 
-    if settings.tracking.depth_bias:
+    if settings.tracking.depth_bias == "correct":
         raise InputError(
             "--live: how depth is wrong (--tracking.depth-bias) is known when all frames were seen; leave it out"
         )

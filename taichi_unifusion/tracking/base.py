@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +40,9 @@ class TrackingSettings:
     """How many recent keyframes a frame is aligned to; internal tracking uses at least 3."""
     loops: bool = True
     """Recognise places seen before, and distribute the drift over the trajectory."""
-    depth_bias: bool = False
-    """rgbd: find depth that is wrong by its place in the image from views that overlap, and correct it, in the map
-    too.
+    depth_bias: Literal["off", "say", "correct"] = "say"
+    """rgbd: look for depth that is wrong by its place in the image, in views that overlap; say so, or correct
+    it, in the map too.
     """
     prior_distance: float = 0.10
     """internal: a refinement that moves a pose further than this from the given one, in metres, is

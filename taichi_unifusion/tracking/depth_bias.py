@@ -97,11 +97,10 @@ class DepthBias:
         """What is still to be corrected, by all pairs."""
         return np.linalg.solve(self.H.sum(axis=0) + WEIGHT, self.b.sum(axis=0))
 
-    @property
-    def largest(self) -> float:
+    def largest(self, bias: NDArray[np.float64]) -> float:
         """The largest share of itself by which depth is corrected, beside a common scale."""
         assert self.camera is not None
-        factor = factors(self.camera, self.known)
+        factor = factors(self.camera, bias)
         return float(np.abs(factor / factor.mean() - 1).max())
 
     def surely(self) -> NDArray[np.float64] | None:

@@ -56,9 +56,8 @@ class InternalTracker(Tracker):
     ) -> None:
         self.prior, self.settings = prior, settings or TrackingSettings()
         self.uses_given_poses, self.warnings = prior.uses_given_poses, prior.warnings
-        alone = replace(
-            self.settings, depth_bias=False
-        )  # poses are not to leave the given ones for it
+        # poses are not to leave the given ones for it
+        alone = replace(self.settings, depth_bias="off")
         self.odometry = KeyframeOdometry(alone, preprocess or PreprocessSettings())
         self.T_world_prior: list[NDArray[np.float64]] = []  # of every keyframe, as given
 

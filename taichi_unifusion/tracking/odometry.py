@@ -15,7 +15,7 @@ from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame
 from .base import CurrentPoses, TrackedFrame, TrackingResult, TrackingSettings, Verdict
-from .depth_bias import DepthBias
+from .depth_bias import LEAST_PAIRS, DepthBias
 from .features import Features, extract_features
 from .keyframes import Keyframe, Keyframes
 from .loop_closure import believable, find_loops, neighbor_edges
@@ -39,6 +39,10 @@ FRAME_CORRECTION = 0.3, np.radians(20)  # [m, rad] a result farther from its gue
 ROUNDS = 2  # of correcting depth and aligning keyframes anew
 BIASED = (
     "tracking: depth is off by up to %.1f%% of itself, by its place in the image, and is corrected"
+)
+SEEMS_BIASED = (
+    "tracking: depth seems to be off by up to %.1f%% of itself, by its place in the image; "
+    "--tracking.depth-bias correct puts it right, in the map too"
 )
 NOT_MET = "in a second map, begun where the camera was lost, which has not met the first yet"
 NEVER_MET = "in a second map, begun where the camera was lost, which never surely met the first"
@@ -186,7 +190,7 @@ class KeyframeOdometry:
         """Add edges from a new keyframe to recent ones, and to older ones that close a loop."""
         weight = self.settings.photometric_weight
         self.edges += neighbor_edges(self.keyframes, number, weight)
-        if self.settings.depth_bias:
+        if self.settings.depth_bias != "off":
             self._look_for_bias(number)
         if not self.settings.loops:
             return
@@ -198,12 +202,18 @@ class KeyframeOdometry:
 
     def _look_for_bias(self, number: int) -> None:
         """Take in what the edges of a new keyframe say of depth that is wrong by its place in the image. Once
-        that is sure, correct it: of all keyframes, which are aligned anew, and of frames to come.
+        that is sure, say so, or correct it: of all keyframes, which are aligned anew, and of frames to come.
         """
+        corrects = self.settings.depth_bias == "correct"
+        if not corrects and self.bias.pairs >= LEAST_PAIRS:
+            return
         for edge in self.edges:
             if edge.b == number and self.bias.looking:
                 self._add_pair(edge)
         if (more := self.bias.surely()) is None:
+            return
+        if not corrects:
+            logger.warning(SEEMS_BIASED, 100 * self.bias.largest(more))
             return
         for _ in range(ROUNDS):
             self.bias.correct(more)
@@ -213,7 +223,7 @@ class KeyframeOdometry:
                 self._add_pair(edge)
             more = self.bias.likeliest
         self.bias.correct(np.zeros_like(more))
-        logger.warning(BIASED, 100 * self.bias.largest)
+        logger.warning(BIASED, 100 * self.bias.largest(self.bias.known))
         self.optimize()
 
     def _add_pair(self, edge: Edge) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from taichi_unifusion.geometry import se3
-from taichi_unifusion.tracking import TrackingResult
+from taichi_unifusion.tracking import TrackingResult, TrackingSettings, track
 from taichi_unifusion.tracking.depth_bias import LEAST_AMOUNT, DepthBias, amount, factors, terms
 from taichi_unifusion.tracking.odometry import KeyframeOdometry
 from taichi_unifusion.tracking.pyramid import build_pyramid, reduce_frame
@@ -87,3 +87,21 @@ def test_frames_are_mapped_as_they_were_tracked(frames):
     )
     depth = PosedFrames(recording, result)[0].depth
     np.testing.assert_allclose(depth, frames[0].depth * factors(frames[0].camera, bias))
+
+
+def test_what_is_found_is_said_once_or_corrected(frames, caplog, monkeypatch):
+    """What pairs of keyframes say is made up."""
+    bias = np.array([0.01, 0.0, 0.02, -0.01, 0.015])
+    monkeypatch.setattr("taichi_unifusion.tracking.odometry.LEAST_PAIRS", 1)
+    monkeypatch.setattr(DepthBias, "surely", lambda self: None if self.known.any() else bias)
+    monkeypatch.setattr(DepthBias, "likeliest", np.zeros(5))
+    details = {}
+    for mode in ("off", "say", "correct"):
+        caplog.clear()
+        settings = TrackingSettings(depth_bias=mode, keyframe_distance=0.02)
+        details[mode] = track(scenes.Listed(frames[:4]), settings, mode="rgbd").tracking.details
+        said = [each for each in caplog.messages if "by its place in the image" in each]
+        assert len(said) == (mode != "off")
+        assert all(("seems to be off" in each) == (mode == "say") for each in said)
+    assert details["correct"]["depth_bias"] == bias.tolist()
+    assert "depth_bias" not in details["say"]
