@@ -95,7 +95,7 @@ def _clipping(of: Arguments) -> tuple[float, float]:
 
 
 def _patches(of: Arguments) -> tuple[float, float]:
-    pixels, pairs = _pixels(of["inverse"]), 2 * (2 * of["radius"] + 1)
+    pixels, pairs = _pixels(of["inverse"]), 2 * (2 * of["sinks"].radius + 1)
     # a quarter as many patches, which read and write a cell of the surface and one of the colours
     moved = pixels * (4 + 3) + pixels / 4 * 2 * 8 * (7 + 4)
     return moved, pixels * (6 * pairs / 4 + 35) + pixels / 4 * 40

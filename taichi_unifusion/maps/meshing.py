@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 CODE_BITS, CODE_OFFSET = 21, 1 << 20
 CODE_STEPS = np.array([1 << 2 * CODE_BITS, 1 << CODE_BITS, 1])  # of one point along x, y and z
 MESH_BLOCK = 16  # cubes along a block of the mesh
+BESIDE = 3  # voxels beside blocks that their cubes may have a corner at, and one more
 # a voxel counts in the cubes of its own number and the next; normals change in those beside them
 REACHES = (-1, 2)
 SNAP = 1e-4  # of an edge: a cut this near to a vertex goes through it
@@ -273,7 +274,12 @@ def _cubes(
     """Sorted codes (Q,) of the cubes that hold surface or close one that does, in or beside
     `blocks`, and their support masks (Q, 2).
     """
-    codes = _with_upper(np.sort(_codes(grid.voxel_keys())))
+    voxels = grid.voxel_keys()
+    if blocks is not None and len(blocks):  # few of many, perhaps
+        low, high = blocks.min(axis=0), blocks.max(axis=0) + 1
+        near = (voxels >= low * MESH_BLOCK - BESIDE) & (voxels <= high * MESH_BLOCK + BESIDE)
+        voxels = np.compress(near.all(axis=1), voxels, axis=0)
+    codes = _with_upper(np.sort(_codes(voxels)))
     if blocks is not None:
         keys = _keys(codes)
         beside = [_lie_in(keys + step, blocks) for step in product((-1, 1), repeat=3)]

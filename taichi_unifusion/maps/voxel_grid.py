@@ -39,6 +39,7 @@ CUDA_TREE, CUDA_CHUNK, CUDA_RESERVE = 90_000_000, 66_000_000, 330_000_000
 NODES_PER_CHUNK = 16_384
 # room to begin with: what a room needs, so that hardly any video waits, but little memory
 FIRST_CAPACITY, LEAST_CAPACITY, FIRST_BYTES, LEAST_BYTES = 131_072, 4096, 16 << 20, 64 << 20
+MAPS_OF_A_RUN = 2  # at least: while there are fewer trees, none is left over from an earlier run
 LARGE = 1 << 20  # voxels from which on room grows by a quarter at a time: it takes memory at once
 
 
@@ -84,8 +85,11 @@ class VoxelGrid:
         not be safe.
         """
         free = self.runtime.free_trees
-        if not free and self.runtime.trees >= runtime.MAX_TREES:
-            gc.collect()  # maps that only a cycle holds, as the traceback of a run that failed
+        alike = any(fields == self.fields for fields, _ in free)
+        if not alike and self.runtime.trees >= MAPS_OF_A_RUN:
+            # maps that only a cycle holds, as the traceback of a run that failed: compiling kernels for
+            # another tree takes seconds
+            gc.collect()
         leaves = 0
         if free:
             _, tree = free.pop(self._most_alike(free))

@@ -196,7 +196,11 @@ def write_video(path: Path, pictures: list[NDArray], codec: str = "libx265") -> 
         stream = container.add_stream(codec, rate=30)
         stream.height, stream.width = pictures[0].shape[:2]
         stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": "4", "x265-params": "log-level=none", "preset": "ultrafast"}
+        stream.options = {
+            "crf": "4",
+            "x265-params": "log-level=none:pools=none:frame-threads=1",
+            "preset": "ultrafast",
+        }
         for picture in pictures:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode(None))
