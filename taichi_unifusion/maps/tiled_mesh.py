@@ -21,6 +21,9 @@ from .working_set import MapMemory
 BLOCKS = np.array(list(product(range(TILE // MESH_BLOCK), repeat=3)), np.int32)  # of a tile
 OnPiece = Callable[[int, int], None]  # is told how many pieces are done, and how many there are
 TOGETHER = 2  # tiles along an edge of those that are meshed at once
+# bytes of maps in memory meanwhile: whatever is there is looked through for every piece, and more than a
+# slab of a floor is not needed again
+IN_MEMORY = 256_000_000
 
 
 def mesh_pieces(
@@ -53,12 +56,15 @@ def mesh_pieces(
     if bounds is not None:
         groups = {key: each for key, each in groups.items() if _meets(key, surface, bounds)}
     for done, ((slab, *_), codes) in enumerate(sorted(groups.items()), 1):
-        memory.near("surface", set(tiles_around(codes)))
-        firsts = np.array([tile_of(code) for code in codes], np.int32) * (TILE // MESH_BLOCK)
-        blocks = (firsts[:, None] + BLOCKS).reshape(-1, 3)
-        mesh = surface.extract_mesh(resolution, bounds=bounds, blocks=blocks, flush=False)
+        with memory.at_most(IN_MEMORY):
+            memory.near("surface", set(tiles_around(codes)))
+            firsts = np.array([tile_of(code) for code in codes], np.int32) * (TILE // MESH_BLOCK)
+            blocks = (firsts[:, None] + BLOCKS).reshape(-1, 3)
+            mesh = surface.extract_mesh(resolution, bounds=bounds, blocks=blocks, flush=False)
+            if len(mesh.faces):
+                mesh = with_properties(memory, mesh)
         if len(mesh.faces):
-            yield slab, with_properties(memory, mesh)
+            yield slab, mesh
         on_piece(done, len(groups))
 
 

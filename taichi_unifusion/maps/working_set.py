@@ -8,7 +8,8 @@ longest are written and dropped, and come back when they are seen again.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -215,6 +216,16 @@ class MapMemory:
         if any(code not in each.loaded and tile_of(code) in each.folder.tiles for code in codes):
             self.shrink({name: codes})
             each.bring(sorted(codes))
+
+    @contextmanager
+    def at_most(self, limit: int) -> Iterator[None]:
+        """Keep maps within fewer bytes for a while, for who reads them piece by piece."""
+        before = self.limit
+        self.limit = min(limit, before)
+        try:
+            yield
+        finally:
+            self.limit = before
 
     def save(self) -> None:
         """Write all that the folders lack; raises FileError."""
