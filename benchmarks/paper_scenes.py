@@ -135,5 +135,5 @@ def _named(path: Path, names: Sequence[str] | None) -> dict[str, str]:
 
 def _some(found: list[Scene], missing: list[str], nothing: str) -> Found:
     if not found:
-        raise FileError(nothing)
+        raise FileError(f"{nothing}; docs/paper.md shows how the root is laid out")
     return Found(tuple(found), tuple(missing))

@@ -156,11 +156,13 @@ def _docstring(options: type) -> str:
     return ast.get_docstring(body) or "" if isinstance(body, ast.ClassDef) else ""
 
 
+def _first_paragraph(options: type) -> str:
+    return " ".join(_docstring(options).split("\n\n")[0].split())
+
+
 def _say_commands(prog: str, description: str, commands: Commands, arguments: list[str]) -> None:
     kinds = (
-        Annotated[
-            options, subcommand(name, description=(_docstring(options) or name).splitlines()[0])
-        ]
+        Annotated[options, subcommand(name, description=_first_paragraph(options) or name)]
         for name, (options, _) in commands.items()
     )
     with no_settings(), whole_sentences():

@@ -22,7 +22,8 @@ EDGES = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]  # 
 
 def add_legend(picture: NDArray[np.uint8], legend: Legend) -> NDArray[np.uint8]:
     """The picture (H, W, 3) RGB with a legend at its lower left."""
-    unit = max(picture.shape[0] / 1080, 0.35)  # everything is sized for 1080 rows
+    rows, columns = picture.shape[:2]  # all is sized for 1080 rows; below 0.5 decimal points vanish
+    unit = max(rows / 1080, min(0.5, columns / 640), 0.35)
     strip = _classes(legend, unit) if legend.names else _scale(legend, unit)
     height, width = (min(a, b) for a, b in zip(strip.shape[:2], picture.shape[:2], strict=True))
     edge = min(round(24 * unit), picture.shape[0] - height, picture.shape[1] - width)

@@ -49,7 +49,7 @@ def test_layers_are_shown_in_their_colors_with_a_legend(scene, pose):
     bare = Picturing(scene, "height", larger, legend=False).picture(pose)
     changed = (height != bare).any(axis=2)
     rows, columns = np.nonzero(changed)
-    assert rows.min() > 300 and columns.max() < 220  # at the lower left
+    assert rows.min() > 290 and columns.max() < 230  # at the lower left
     assert np.abs(bare[::4, ::4].astype(int) - plain).max() > 50
 
 
