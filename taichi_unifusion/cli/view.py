@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from ..viewer.source import ResultsSource
 
 
-NOTHING_TO_ASK = "{}: there are no features to ask, or no text encoder"
+NOTHING_TO_ASK = (
+    "{}: there are no features to ask, or no text encoder; `unifusion understand` makes features, "
+    "--text names an encoder"
+)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .. import runtime
 from ..config import MeshSettings, load_config
-from ..errors import InputError
+from ..errors import FileError, InputError
 from ..maps.stored import read_description
 from ..results.run_folder import RunFolder
 from ..types import Mesh
@@ -205,7 +205,13 @@ class ResultsSource:
         from ..maps.by_tiles import open_features
 
         runtime.current()
-        return open_features(self._folder.features)
+        features = self._folder.features
+        if not features.exists():
+            raise FileError(
+                f"{self.path}: no {self._folder.relative(features)} here; give the results folder of "
+                "`unifusion understand`"
+            )
+        return open_features(features)
 
     @cached_property
     def _encoder(self) -> TextEncoder:
