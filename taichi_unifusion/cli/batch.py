@@ -40,7 +40,7 @@ class Batch:
 
 def batch(options: Batch) -> int:
     """Recordings -> results folders -> a table."""
-    from ..cluster.batch import is_done, read_scenes, run_scene, tabulate
+    from ..cluster.batch import is_done, last_error, read_scenes, run_scene, tabulate
     from ..cluster.engine import open_engine
     from ..files.atomic import check_writable, write_text
     from ..results.tables import format_table
@@ -65,8 +65,11 @@ def batch(options: Batch) -> int:
         for scene, result in zip(missing, found, strict=True):
             if result != DONE:
                 failed.append(scene.name)
-                why = f"exit code {result}" if isinstance(result, int) else result
-                logger.error("%s: %s; see %s", scene.name, why, scene.log(out))
+                log = scene.log(out)
+                why = result
+                if isinstance(result, int):
+                    why = last_error(log) or f"exit code {result}"
+                logger.error("%s: %s; see %s", scene.name, why, log)
     rows, values = tabulate(scenes, out)
     write_text(out / "table.json", json.dumps(values, indent=2) + "\n")
     print(json.dumps(values, indent=2) if options.json else format_table(rows))

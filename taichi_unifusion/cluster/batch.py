@@ -22,6 +22,7 @@ from .engine import own_kernels
 COMMANDS = ("reconstruct", "transfer", "understand")
 SCENE_KEYS = ("name", "command", "format", "path", "options")
 COLUMNS = ("scene", "frames", "skipped", "seconds", "ms a frame", "triangles", "memory MB")
+SAID = "unifusion: error: "  # how an error begins in a log
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,15 @@ def _mapping(value: Any, at: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise InputError(f"{at}: expected keys and values, got {value!r:.80}")
     return value
+
+
+def last_error(log: Path) -> str:
+    """The last error that a scene's run has written into its log; "" where there is none."""
+    try:
+        lines = log.read_text("utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    return next((each[len(SAID) :] for each in reversed(lines) if each.startswith(SAID)), "")
 
 
 def run_scene(scene: Scene, out: str) -> int:

@@ -81,7 +81,7 @@ def test_a_scene_is_done_when_it_was_run_with_the_same_arguments(tmp_path):
     assert not is_done(Scene(scene.name, (*scene.arguments, "--every", "2")), tmp_path)
 
 
-def test_scenes_run_and_make_a_table(tmp_path, capsys, monkeypatch):
+def test_scenes_run_and_make_a_table(tmp_path, capsys, monkeypatch, caplog):
     """The second time nothing is run but what is missing, which is named."""
     monkeypatch.setattr(
         "taichi_unifusion.cluster.engine.open_engine", lambda _: nullcontext(Direct())
@@ -96,6 +96,7 @@ def test_scenes_run_and_make_a_table(tmp_path, capsys, monkeypatch):
     table = capsys.readouterr().out
     assert "mean of 1" in table and "missing" in table
     assert "no such" in (tmp_path / "out/gone.log").read_text()
+    assert "gone: no such file or folder; see" in caplog.text
     record = (tmp_path / "out/room/metrics.json").stat().st_mtime_ns
     assert command.batch(options) == 2
     assert (tmp_path / "out/room/metrics.json").stat().st_mtime_ns == record
