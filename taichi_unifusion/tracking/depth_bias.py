@@ -20,17 +20,11 @@ from .registration import GATES, MAX_ANGLE
 TERMS = 5
 LEVEL = 1  # of the pyramid that is compared
 STEP = 2  # [px] there, between pixels that are compared
-NOISE = (
-    0.0015  # [1/m] standard deviation of a reading at 1 m; it grows with the square of the distance
-)
+NOISE = 0.0015  # [1/m] standard deviation of a reading at 1 m; grows with the distance squared
 LEAST_PAIRS = 60  # before anything is believed
-LEAST_AMOUNT = (
-    0.004  # share of the depth, root mean square over the image, that is worth correcting
-)
+LEAST_AMOUNT = 0.004  # share of the depth, root mean square over the image, worth correcting
 SAME = 0.4  # share of it by which halves of the pairs may differ
-WEIGHT = (
-    np.eye(TERMS) / 0.01**2
-)  # of coefficients: their standard deviation before anything is seen
+WEIGHT = np.eye(TERMS) / 0.01**2  # of coefficients: by their deviation before anything is seen
 MOST_PAIRS = 150  # that are looked at
 INDEPENDENT = 200.0  # measurements that one pair counts as
 GRID = 12  # points along an image's side, by which amounts are judged
@@ -163,9 +157,9 @@ def _equations(
     weight = 1 / sigma**2 / (1 + (r / (2 * spread * sigma)) ** 2)
     weight *= INDEPENDENT / len(r)
     H, g = (J * weight[:, None]).T @ J, (J * weight[:, None]).T @ r
-    pose = np.linalg.solve(H[:6, :6] + 1e-9 * np.trace(H[:6, :6]) * np.eye(6), H[:6])
-    left = np.linalg.solve(H[:6, :6] + 1e-9 * np.trace(H[:6, :6]) * np.eye(6), g[:6])
-    return H[6:, 6:] - H[6:, :6] @ pose[:, 6:], -(g[6:] - H[6:, :6] @ left)
+    damped = H[:6, :6] + 1e-9 * np.trace(H[:6, :6]) * np.eye(6)
+    pose = np.linalg.solve(damped, np.column_stack([H[:6, 6:], g[:6]]))
+    return H[6:, 6:] - H[6:, :6] @ pose[:, :-1], -(g[6:] - H[6:, :6] @ pose[:, -1])
 
 
 def _surfels(
