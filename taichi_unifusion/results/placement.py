@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError
-from ..files.atomic import read_bytes, write_text
+from ..files.atomic import write_text
 from ..tracking.keyframe_file import read_keyframes, write_keyframes
 from ..tracking.keyframes import Keyframes
 from .record import Source, decoded
 from .run_folder import RunFolder
-from .safe_point import VERSION, Recipe, check_same
+from .safe_point import VERSION, Recipe, read_for
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,16 +50,11 @@ def read_placement(folder: RunFolder, recipe: Recipe) -> tuple[Placement, Keyfra
     """What `write_placement` kept; None where there is nothing. Raises InputError where the run had other
     settings, FileError where a file is damaged.
     """
-    file = folder.placement
-    if not file.exists():
-        return None
-    try:
-        values = json.loads(read_bytes(file))
-        theirs = decoded(Recipe, values["recipe"])
+
+    def parse(values: Mapping[str, Any]) -> Placement:
         motion = np.array(values["motion"], np.float64).reshape(len(values["places"]), 4, 4)
         sources = tuple(decoded(Source, each) for each in values["sources"])
-        found = Placement(tuple(values["places"]), motion, values["details"], sources)
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise FileError(f"{file}: a damaged file ({error}); run without --resume") from None
-    check_same(recipe, theirs)
-    return found, read_keyframes(folder.placed_keyframes)
+        return Placement(tuple(values["places"]), motion, values["details"], sources)
+
+    found = read_for(recipe, folder.placement, parse)
+    return None if found is None else (found, read_keyframes(folder.placed_keyframes))

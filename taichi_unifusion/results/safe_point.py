@@ -19,11 +19,11 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
@@ -43,6 +43,8 @@ from .run_folder import RunFolder
 from .tiled import open_memory
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 VERSION = 1
 
@@ -186,19 +188,28 @@ def read_tracking(folder: RunFolder, recipe: Recipe) -> TrackingResult | None:
     """What the tracker of a run found that is to go on; None where it was not through. Raises
     InputError where the run had other settings, FileError where the file is damaged.
     """
-    file = folder.tracking_state
+
+    def parse(values: Mapping[str, Any]) -> TrackingResult:
+        frames = tuple(_tracked_frame(frame) for frame in values["frames"])
+        keyframes, loops = values["keyframes"], [tuple(pair) for pair in values["loops"]]
+        return TrackingResult(frames, tuple(keyframes), tuple(loops), values["details"])
+
+    return read_for(recipe, folder.tracking_state, parse)
+
+
+def read_for(recipe: Recipe, file: Path, parse: Callable[[Mapping[str, Any]], T]) -> T | None:
+    """What `parse` makes of a JSON file that was written by a run with this recipe; None where there is
+    none. Raises InputError where that run had other settings, FileError where the file is damaged.
+    """
     if not file.exists():
         return None
     try:
         values = json.loads(read_bytes(file))
-        theirs = decoded(Recipe, values["recipe"])
-        frames = tuple(_tracked_frame(frame) for frame in values["frames"])
-        keyframes, loops = values["keyframes"], [tuple(pair) for pair in values["loops"]]
-        result = TrackingResult(frames, tuple(keyframes), tuple(loops), values["details"])
+        theirs, found = decoded(Recipe, values["recipe"]), parse(values)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise FileError(f"{file}: a damaged file ({error}); run without --resume") from None
     check_same(recipe, theirs)
-    return result
+    return found
 
 
 def _tracked_frame(values: dict[str, Any]) -> TrackedFrame:
