@@ -107,7 +107,13 @@ def settings_of(experiment: Experiment, options: argparse.Namespace) -> Settings
     words = [
         w for flag, n in more if getattr(options, n, None) for w in (flag, getattr(options, n))
     ]
-    return replace(experiment.settings, **chosen, text_options=tuple(words))
+    settings = replace(experiment.settings, **chosen, text_options=tuple(words))
+    if settings.every < experiment.least_every:
+        raise InputError(
+            f"--every {settings.every}: {experiment.name} compares frames between those that are mapped; "
+            f"give {experiment.least_every} or more"
+        )
+    return settings
 
 
 def method_of(name: str) -> tuple[str, Path | None]:

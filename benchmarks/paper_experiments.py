@@ -48,6 +48,7 @@ class Experiment:
     commands: Callable[[Scene, Path, Path | None, Settings], list[Command]]  # in a folder
     numbers: Callable[[Path], dict[str, Any]]  # from that folder
     settings: Settings = Settings()  # as published
+    least_every: int = 1  # more where frames between those that are mapped are compared
     prepare: Callable[[Scene, Path], None] = lambda scene, folder: None
 
 
@@ -246,6 +247,7 @@ RENDERING = Experiment(
     _rendering_commands,
     _rendering_numbers,
     Settings(tracking="rgbd"),
+    least_every=2,
 )
 SCANNET_CLASSES = Experiment(
     "scannet-classes",
@@ -259,5 +261,5 @@ S3DIS_CLASSES = Experiment(
     _segmentation_commands(S3DIS13),
     _segmentation_numbers,
     Settings(every=1),  # its images overlap little
-    _prepare_room,
+    prepare=_prepare_room,
 )

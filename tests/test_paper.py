@@ -163,6 +163,12 @@ def test_rendering_of_replica(tmp_path, here, mini, capsys):
     assert command[command.index("--every") + 1] == "10"
     with pytest.raises(InputError, match="did you mean 'office-1'"):
         paper_scenes.replica(root, ["ofice-1"])
+    # frames between those that are mapped are compared: there must be some, which is said at once
+    del here[:]
+    with pytest.raises(InputError, match="--every 1.*give 2 or more"):
+        options = paper.parser().parse_args(["III", str(root), "--every", "1", *mini])
+        paper.run_table(paper_tables.TABLES["III"], options)
+    assert not here
 
 
 def test_tracking_on_tum(tmp_path, here, mini, capsys):

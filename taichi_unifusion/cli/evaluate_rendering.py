@@ -138,9 +138,17 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
         about,
         result,
         _table(result),
-        f"Means over {len(result.frames)} frames of {recording.name}, {compared}; colour from the "
-        f"{about['colour']}.",
+        f"Means over {len(result.frames)} frames of {recording.name} ({_which(chosen)}), {compared}; "
+        f"colour from the {about['colour']}.",
     )
+
+
+def _which(chosen: Sequence[int]) -> str:
+    """The frames by their numbers: "5, 15, 25 ... 295", and how to choose others."""
+    few = [str(index) for index in chosen[:3]]
+    last = f" ... {chosen[-1]}" if len(chosen) > 4 else ""
+    few += [str(chosen[3])] if len(chosen) == 4 else []
+    return f"{', '.join(few)}{last}; --start, --end and --every choose others"
 
 
 def _table(result: RenderingResult) -> str:

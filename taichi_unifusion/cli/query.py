@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ..results.tables import format_table
 from .options import TextOptions
@@ -58,6 +58,8 @@ class Query:
     """Regions of less than this area, in square metres, are left out."""
     top: Annotated[int, arg(metavar="N")] = 10
     """Regions to list for each text."""
+    list_names: FlagCreatePairsOff[bool] = False
+    """Print the names that an embeddings file holds, one a line with its synonyms, and end."""
     encoder: Annotated[TextOptions, arg(name="")] = field(default_factory=TextOptions)
 
 
@@ -66,6 +68,9 @@ def query(options: Query) -> int:
     """Texts -> meshes, pictures and regions."""
     from ..errors import InputError
 
+    if options.list_names:
+        print("\n".join(_names(options)))
+        return 0
     if not options.texts:
         raise InputError(
             'query: say what to look for, for example: unifusion query results/flat "sofa"'
@@ -107,6 +112,19 @@ def query(options: Query) -> int:
         f"{folder.record}: could not be updated", lambda: add_answers(folder, writer.written)
     )
     return report(writer.failures)
+
+
+def _names(options: Query) -> list[str]:
+    """Of the embeddings file asked for, each with its synonyms; InputError for another encoder."""
+    from ..errors import InputError
+    from ..language.embeddings import TextEmbeddings
+
+    encoder = make_encoder(options.encoder, "", options.dir)
+    if not isinstance(encoder, TextEmbeddings):
+        raise InputError(
+            f"query: {encoder.name} takes any text; --list-names is for --text embeddings:FILE"
+        )
+    return encoder.listing()
 
 
 def split_known(

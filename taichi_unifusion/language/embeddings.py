@@ -45,8 +45,8 @@ class TextEmbeddings:
             return row
         near = self._spelled_like(_plain(text))
         raise InputError(
-            f"{self.name}: has no vector for '{text}'{near}; it holds {len(self.names)} names, and "
-            "with a text encoder any text can be asked"
+            f"{self.name}: has no vector for '{text}'{near}; it holds {len(self.names)} names (query "
+            "--list-names prints them), and with a text encoder any text can be asked"
         )
 
     def _find(self, text: str) -> int | None:
@@ -67,6 +67,17 @@ class TextEmbeddings:
         ]
         words = " or ".join(f"'{name}'" for name in near[:2])
         return f" (did you mean {words}?)" if words else ""
+
+    def listing(self) -> list[str]:
+        """Every name, followed by what else finds it: 'sofa: couch, lounge'."""
+        others: dict[int, list[str]] = {}
+        for word, row in self.synonyms.items():
+            if _plain(word) != _plain(self.names[row]):
+                others.setdefault(row, []).append(word)
+        return [
+            f"{name}: {', '.join(sorted(others[row]))}" if row in others else name
+            for row, name in enumerate(self.names)
+        ]
 
     def has(self, text: str) -> bool:
         """Whether there is a vector for the text."""

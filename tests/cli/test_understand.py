@@ -141,6 +141,11 @@ def test_what_is_not_found_leaves_no_mesh_and_what_is_unknown_does_not_cost_the_
     assert not red["found"] and "mesh" not in red and "no vector" in mauve["reason"]
 
 
+def test_the_names_of_an_embeddings_file_are_listed(made, embeddings, capsys):
+    assert ask(made, embeddings, "query", "--list-names") == 0
+    assert capsys.readouterr().out.split() == list(NAMES)
+
+
 def test_segmentation_names_every_vertex_and_measures_itself(made, embeddings, tmp_path, capsys):
     (tmp_path / "labels.txt").write_text("7 red\n8 green\n9 blue\n")
     mesh = read_mesh(made / "mesh.ply")
@@ -196,6 +201,7 @@ def test_wrong_questions_end_with_one_sentence(made, embeddings, tmp_path, capfd
     wide = f"embeddings:{tmp_path / 'wide.npz'}"
     for arguments, message in (
         (["query", str(made), "red"], "give the text encoder"),
+        (["query", str(made), "--list-names"], "give the text encoder"),
         (
             ["query", str(tmp_path / "none"), "red", "--text", f"embeddings:{embeddings}"],
             "no maps/features.safetensors",

@@ -71,6 +71,11 @@ def names_file(tmp_path):
     return read_embeddings(tmp_path / "vectors.npy")
 
 
+def test_a_listing_holds_every_name_and_its_synonyms_once(names_file):
+    kitchen = unicodedata.normalize("NFD", "Küche") + ": kitchen"
+    assert names_file.listing() == ["sofa: couch, lounge", "pouch", "crutch", kitchen, "chair"]
+
+
 @pytest.mark.parametrize(
     ("text", "row"),
     [("couch", 0), ("Lounge", 0), ("sofa", 0), ("pouch", 1), ("küche", 3), ("kitchen", 3)],
