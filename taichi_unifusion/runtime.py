@@ -12,6 +12,7 @@ import linecache
 import logging
 import os
 import platform
+import signal
 import subprocess
 import sys
 import textwrap
@@ -303,6 +304,19 @@ def _say(sentence: str) -> None:
         print(sentence, file=sys.stderr)
 
 
+@contextmanager
+def _signals_later() -> Iterator[None]:
+    """Ctrl-C and SIGTERM wait: in the middle of its import Taichi would call itself broken."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def import_taichi() -> Any:
     """Taichi, or what UNIFUSION_TAICHI names, such as `taichi_forge`; kernels are imported after it."""
     os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -310,7 +324,7 @@ def import_taichi() -> Any:
     os.environ.setdefault("HOME", os.path.expanduser("~"))  # without one Taichi ends the process
     name = os.environ.get("UNIFUSION_TAICHI") or "taichi"
     try:
-        with _frames_read_quickly():
+        with _frames_read_quickly(), _signals_later():
             taichi = import_module(name)
             taichi.lang.kernel_impl.inspect = SimpleNamespace(**vars(inspect))  # quick for good
     except (ImportError, OSError) as error:

@@ -15,13 +15,23 @@ INTERRUPTED = 130  # exit code
 def main() -> int:
     """Run the command line of this process and return its exit code."""
     open_what_is_closed()
-    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:  # else somebody wants it ignored
-        signal.signal(signal.SIGTERM, _as_ctrl_c)
+    asked: list[int] = []  # signals that came
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        asked.append(number)
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if callable(handler := signal.getsignal(number)) or handler is signal.SIG_DFL:
+            signal.signal(number, stop)  # else somebody wants it ignored
     try:
         from .main import main as run
 
         code = run()
-    except KeyboardInterrupt:  # while modules were imported
+    except (KeyboardInterrupt, Exception) as error:
+        # while modules were imported; compiled ones make an ImportError or the like of the first
+        if not asked and not isinstance(error, KeyboardInterrupt):
+            raise
         os.write(2, b"unifusion: error: stopped\n")
         code = INTERRUPTED
 
@@ -46,7 +56,3 @@ def open_what_is_closed() -> None:
             if getattr(sys, name) is None:
                 mode = "r" if number == 0 else "w"
                 setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
-
-
-def _as_ctrl_c(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

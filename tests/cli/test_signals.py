@@ -37,6 +37,30 @@ class Slow:
             wait()
 sys.meta_path.insert(0, Slow())
 """
+# as compiled modules, which make another error of it
+COMPILED = """
+class Compiled:
+    def find_spec(self, name, path=None, target=None):
+        if name == "tyro":
+            try:
+                wait()
+            except KeyboardInterrupt:
+                raise ImportError("initialization failed") from None
+sys.meta_path.insert(0, Compiled())
+"""
+TAICHI = """
+class Slow:
+    def find_spec(self, name, path=None, target=None):
+        if name == "taichi._lib.core.taichi_python":
+            sys.stderr.write("now\\n")
+            sys.stderr.flush()
+            try:
+                time.sleep(2)
+            except KeyboardInterrupt:
+                sys.stderr.write("broken\\n")
+                raise ImportError("initialization failed") from None
+sys.meta_path.insert(0, Slow())
+"""
 AT_THE_END = "import atexit\natexit.register(wait)"
 WRITING = """
 from taichi_unifusion.files import atomic
@@ -76,11 +100,20 @@ def signalled(moment: str, number: signal.Signals, *arguments: str) -> tuple[int
 
 @pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize(
-    ("moment", "code"), [(IMPORTING, 130), (AT_THE_END, 0)], ids=["imports", "end"]
+    ("moment", "code"),
+    [(IMPORTING, 130), (COMPILED, 130), (AT_THE_END, 0)],
+    ids=["imports", "compiled", "end"],
 )
 def test_c16_R3_R4_signals_at_the_edges_are_no_traceback(number, moment, code):
     ended, said = signalled(moment, number, "--version")
     assert ended == code and said == ("unifusion: error: stopped\n" if code else "")
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_c16_R3_R4_a_signal_waits_until_taichi_is_imported(number, tmp_path):
+    out = str(tmp_path / "out")
+    ended, said = signalled(TAICHI, number, "reconstruct", "synthetic", "--end", "1", "--out", out)
+    assert ended == 130 and said == "unifusion: error: stopped\n"
 
 
 def test_c16_R4_a_signal_while_mesh_writes_leaves_no_temporary_file(made, tmp_path):
