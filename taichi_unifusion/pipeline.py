@@ -264,6 +264,8 @@ class Pipeline:
         had.
         """
         lacking = {}
+        if frame.color is None:
+            lacking["color"] = f"{frame.label}: there is no colour image"
         for name, source in self.sources.items():
             try:
                 with clock.stage(f"{name} image"):

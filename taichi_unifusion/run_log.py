@@ -76,7 +76,7 @@ class StepResult:
     points: int  # after preprocessing
     integrations: Mapping[str, Integration]  # by map
     milliseconds: Mapping[str, float]  # by stage
-    # property -> why the frame does not give it
+    # property, color and features among them -> why the frame does not give it
     lacking: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -116,7 +116,6 @@ class RunSoFar:
     warnings: tuple[str, ...]
     seconds: float
     scale_checked: bool
-    color_missing: bool
     poses_judged: bool
     doubts: tuple[str, ...]
     readings: tuple[int, ...]
@@ -142,7 +141,7 @@ class RunLog:
         self.reasons: Counter[str] = Counter()
         self.poses: list[tuple[float | None, np.ndarray]] = []  # time stamp, T_world_camera
         self.warnings: list[str] = []
-        self.scale_checked = self.color_missing = False
+        self.scale_checked = False
         self.early = EarlyPairs()  # frames whose poses are checked against their depth
         self.doubts: list[str] = []  # said again at the end
         self.done = 0  # frames tried
@@ -158,7 +157,7 @@ class RunLog:
         self.steps, self.skipped = list(before.steps), list(before.skipped)
         self.reasons.update(frame.reason for frame in before.skipped)
         self.poses = list(zip(before.timestamps, before.T_world_camera, strict=True))
-        self.scale_checked, self.color_missing = before.scale_checked, before.color_missing
+        self.scale_checked = before.scale_checked
         self.readings, self.doubts = np.array(before.readings, np.int64), list(before.doubts)
         if before.poses_judged:
             self.early.take()
@@ -175,7 +174,6 @@ class RunLog:
             tuple(self.warnings),
             time.perf_counter() - self.started,
             self.scale_checked,
-            self.color_missing,
             self.early.kept is None,
             tuple(self.doubts),
             tuple(self.readings.tolist()),
@@ -239,11 +237,6 @@ class RunLog:
             self.doubts.append(sentence)
 
     def add_step(self, frame: Frame, step: StepResult, waited: float) -> None:
-        if frame.color is None and not self.color_missing:
-            self.color_missing = True
-            self.warn(
-                f"{frame.label}: there is no colour image; frames without one add to the surface only"
-            )
         for name, reason in step.lacking.items():
             if not any(name in earlier.lacking for earlier in self.steps):
                 self.warn(f"{reason}; frames without it add to the other maps only")

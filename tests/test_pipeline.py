@@ -20,6 +20,7 @@ from taichi_unifusion.errors import DatasetError, FrameError, OutOfRange, PoseEr
 from taichi_unifusion.maps import PropertyMap
 from taichi_unifusion.pipeline import Pipeline, extract_mesh, warm_up
 from taichi_unifusion.preprocessing import PreprocessSettings
+from taichi_unifusion.results.measure import frames_without
 from taichi_unifusion.run_log import SKIP_REASONS, EmptyFrame
 
 STAGES = ["load", "preprocess", "sum"]
@@ -318,6 +319,7 @@ def test_F9_a_wrong_depth_scale_is_warned_of(frames, tmp_path):
 def test_frames_without_colour_add_to_the_surface_only(pipeline, frames):
     result = pipeline.run([replace(frame, color=None) for frame in frames])
     assert len(result.warnings) == 1 and "no colour image" in result.warnings[0]
+    assert frames_without(result.steps)["color"].frames == tuple(frame.index for frame in frames)
     assert len(pipeline.surface) > 0 and len(pipeline.properties["color"]) == 0
 
 

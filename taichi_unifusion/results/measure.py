@@ -22,6 +22,7 @@ from .folder_writer import FolderWriter
 from .property_files import looks_of
 from .record import (
     FrameCounts,
+    Lacking,
     MapRecord,
     MeshRecord,
     Milliseconds,
@@ -100,7 +101,18 @@ def _count_frames(run: RunResult) -> FrameCounts:
             SkipReason(reason, count, first[reason]) for reason, count in reasons.most_common()
         ),
         skipped_frames=tuple(Skipped(frame.index, frame.message) for frame in run.skipped),
+        without=frames_without(run.steps),
     )
+
+
+def frames_without(steps: Sequence[StepResult]) -> dict[str, Lacking]:
+    """By name of a map, the frames that gave it nothing, and why the first did not."""
+    names = dict.fromkeys(name for step in steps for name in step.lacking)
+    lacking = {name: [step for step in steps if name in step.lacking] for name in names}
+    return {
+        name: Lacking(tuple(step.index for step in found), found[0].lacking[name])
+        for name, found in lacking.items()
+    }
 
 
 def _shown(mesh: Mesh | None, name: str, look: Look, run: RunResult) -> PropertyRecord:

@@ -70,6 +70,14 @@ class Skipped:
     message: str
 
 
+@dataclass(frozen=True)
+class Lacking:
+    """Frames that were used but gave nothing to one of the maps, and what was said of the first."""
+
+    frames: tuple[int, ...]  # by their place in the recording
+    first: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrameCounts:
     """What became of the frames."""
@@ -79,6 +87,8 @@ class FrameCounts:
     interrupted: bool  # asked to stop before the last frame
     reasons: tuple[SkipReason, ...] = ()
     skipped_frames: tuple[Skipped, ...]
+    # by the map that was left out: color, features, a property
+    without: Mapping[str, Lacking] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

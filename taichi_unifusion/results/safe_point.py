@@ -76,7 +76,6 @@ class State:
     warnings: tuple[str, ...]
     seconds: float
     scale_checked: bool
-    color_missing: bool
     poses_judged: bool
     doubts: tuple[str, ...]
     readings: tuple[int, ...]
@@ -157,7 +156,6 @@ def read_so_far(folder: RunFolder, state: State) -> RunSoFar:
         state.warnings,
         state.seconds,
         state.scale_checked,
-        state.color_missing,
         state.poses_judged,
         state.doubts,
         state.readings,

@@ -169,7 +169,6 @@ class RunSaver:
             warnings=so_far.warnings,
             seconds=round(so_far.seconds, 3),
             scale_checked=so_far.scale_checked,
-            color_missing=so_far.color_missing,
             poses_judged=so_far.poses_judged,
             doubts=so_far.doubts,
             readings=so_far.readings,

@@ -46,6 +46,10 @@ def summarize(record: RunRecord, files: Sequence[str], directory: Path) -> str:
         f"           {entry.frames} {entry.reason} (first: {entry.first})"
         for entry in frames.reasons
     ]
+    lines += [
+        f"           {len(entry.frames)} without {name} (first: {entry.first})"
+        for name, entry in frames.without.items()
+    ]
     lines += ["", format_table(stages)]
     if frames.used == 1:  # with more, the first is left out of the table
         lines.append("kernels were compiled for this frame: further ones take a fraction of that")
@@ -66,9 +70,13 @@ def summarize(record: RunRecord, files: Sequence[str], directory: Path) -> str:
 
 
 def count_frames(frames: FrameCounts) -> str:
-    """How many frames were used, and how many were not."""
+    """How many frames were used, how many of these lack something, and how many were not."""
+    lacking = ", ".join(
+        f"{len(each.frames)} without {name}" for name, each in frames.without.items()
+    )
+    lacking = f" ({lacking})" if lacking else ""
     stopped = ", stopped early" if frames.interrupted else ""
-    return f"{frames.used} used, {frames.skipped} skipped{stopped}"
+    return f"{frames.used} used{lacking}, {frames.skipped} skipped{stopped}"
 
 
 def describe_origin(record: RunRecord) -> str:

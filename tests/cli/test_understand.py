@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -243,6 +244,23 @@ def test_wrong_questions_end_with_one_sentence(made, embeddings, tmp_path, capfd
         error = capfd.readouterr().err
         assert message in error and "Traceback" not in error
     assert not (tmp_path / "none").exists()  # a folder that is asked by mistake is not made
+
+
+def test_frames_without_features_are_counted(recording, tmp_path, capsys):
+    folder, out = tmp_path / "features", tmp_path / "out"
+    shutil.copytree(recording / "clip", folder)
+    (folder / "0.npy").write_bytes(b"no array")
+    (folder / "2.npy").unlink()
+    run = ["understand", "folder", str(recording), *FLAGS, "--features", f"folder:{folder}"]
+    assert cli.main([*run, "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "3 used (2 without features), 0 skipped" in said
+    assert "2 without features (first: " in said and "0.npy" in said
+    lacking = json.loads((out / "metrics.json").read_text())["frames"]["without"]
+    assert lacking.keys() == {"features"} and lacking["features"]["frames"] == [0, 2]
+    assert "0.npy" in lacking["features"]["first"]
+    assert cli.main(["info", str(out)]) == 0
+    assert "3 used (2 without features), 0 skipped" in capsys.readouterr().out
 
 
 def test_frames_without_features_still_give_their_surface(frames, tmp_path):

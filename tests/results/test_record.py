@@ -10,6 +10,7 @@ from taichi_unifusion.errors import FileError
 from taichi_unifusion.results.record import (
     SCHEMA_VERSION,
     FrameCounts,
+    Lacking,
     MapRecord,
     MeshRecord,
     Milliseconds,
@@ -49,6 +50,7 @@ FULL = RunRecord(
         interrupted=True,
         reasons=(SkipReason("no usable depth", 1, "frame 5: empty"),),
         skipped_frames=(Skipped(5, "frame 5: empty"),),
+        without={"features": Lacking((2, 8), "frame 2: no file")},
     ),
     milliseconds={"surface": Milliseconds(2.0, 2.5), "frame": Milliseconds(3.0, 3.5)},
     seconds=Seconds(1.0, 2.0, 0.5),
