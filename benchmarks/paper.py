@@ -23,18 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import paper_pictures as pictures
-from paper_experiments import METHODS, S3DIS_CLASSES, SURFACE, Experiment, Settings
+from paper_experiments import S3DIS_CLASSES, SURFACE, Experiment, Settings
+from paper_methods import METHODS, methods_of
+from paper_report import markdown, report
 from paper_runs import STOPPED, Results, column, read_results, run_scenes
 from paper_scenes import read_list
-from paper_tables import (
-    NOTHING,
-    TABLES,
-    ByExperiment,
-    Table,
-    more_rows,
-    paper_rows,
-    summary,
-)
+from paper_tables import NOTHING, TABLES, ByExperiment, Table, paper_rows, summary
 
 from taichi_unifusion.errors import InputError, UniFusionError
 from taichi_unifusion.files.atomic import check_writable, write_text
@@ -47,17 +41,6 @@ FIGURES = {  # name -> study of ablation.py, what it shows
 TIMES = "milliseconds a frame of 1280 x 720, by map, and of tracking"
 
 
-def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """A header and rows as a table; columns of numbers are aligned to the right."""
-    header, *lines = rows
-    numeric = [
-        all(line[i][:1].isdigit() or line[i] == NOTHING for line in lines)
-        for i in range(len(header))
-    ]
-    rule = ["---:" if right else "---" for right in numeric]
-    return "\n".join(f"| {' | '.join(row)} |" for row in (header, rule, *lines))
-
-
 def experiment_of(table: Table, root: Path) -> Experiment:
     """The experiment that a root is for: an area of 2D-3D-S tells S3DIS from ScanNet."""
     if len(table.experiments) == 1:
@@ -66,24 +49,36 @@ def experiment_of(table: Table, root: Path) -> Experiment:
     return next(each for each in table.experiments if (each is S3DIS_CLASSES) == areas)
 
 
+def roots_by_experiment(table: Table, roots: Sequence[Path]) -> dict[Experiment, Path]:
+    """What is run in which root; raises InputError for two roots of one data set."""
+    found: dict[Experiment, Path] = {}
+    for root in roots:
+        experiment = experiment_of(table, root)
+        if experiment in found:
+            raise InputError(
+                f"{found[experiment]} and {root} are both taken for {experiment.name}; give one "
+                "root a data set"
+            )
+        found[experiment] = root
+    return found
+
+
 def run_table(table: Table, options: argparse.Namespace) -> int:
     """Run the scenes of all roots under all methods, then write and print the table."""
-    out = check_writable(options.out)
+    methods, out = methods_of(options.methods), check_writable(options.out)
     names = read_list(options.list) if options.list else options.scenes
     found: dict[str, dict[str, Results]] = {}
-    for root in options.roots:
-        experiment = experiment_of(table, root)
+    for experiment, root in roots_by_experiment(table, options.roots).items():
         here = experiment.find(root, names)
         settings = settings_of(experiment, options)
         print(f"{root}: {len(here.scenes)} scenes, {len(here.missing)} on the list but not here")
-        for name in options.methods:
-            method, config = method_of(name)
-            folder = out / experiment.name / method
+        for method in methods:
+            folder = out / experiment.name / method.name
             results = run_scenes(
-                experiment, here.scenes, folder, config, settings, options.keep_maps
+                experiment, here.scenes, folder, method, settings, options.keep_maps
             )
             results.missing = here.missing
-            found.setdefault(method, {})[experiment.name] = results
+            found.setdefault(method.name, {})[experiment.name] = results
     for method, results in found.items():  # the halves of Table V may be run one by one
         for experiment in table.experiments:
             if experiment.name not in results:
@@ -114,52 +109,6 @@ def settings_of(experiment: Experiment, options: argparse.Namespace) -> Settings
             f"give {experiment.least_every} or more"
         )
     return settings
-
-
-def method_of(name: str) -> tuple[str, Path | None]:
-    """A method's name and configuration: one of METHODS, or a YAML file."""
-    if name in METHODS:
-        return name, METHODS[name]
-    path = Path(name)
-    if path.suffix in (".yaml", ".yml") and path.exists():
-        return path.stem, path.resolve()
-    raise InputError(f"method '{name}' is unknown; there are {', '.join(METHODS)} and FILE.yaml")
-
-
-def report(table: Table, found: Mapping[str, ByExperiment]) -> str:
-    """The table, what else was measured, and which scenes failed or are not there."""
-    header, *rows = paper_rows(table.number)
-    for method, results in found.items():
-        done = sum(len(each.done) for each in results.values())
-        said = f"{method} ({done} scene{'s' * (done != 1)})"
-        rows += [[said, *row[1:]] for row in table.rows(method, results, header)]
-    blocks = [f"\nTable {table.number}: {table.title}", markdown([header, *rows])]
-    if table.more:
-        blocks.append("Ours, means over the scenes:\n\n" + markdown(more_rows(table, found)))
-    for method, by_experiment in found.items():
-        blocks += [
-            _counted(f"{method}, {name}", results)
-            for name, results in by_experiment.items()
-            if results.done or results.failed
-        ]
-    return "\n\n".join(blocks)
-
-
-def _counted(what: str, results: Results) -> str:
-    if results.kept:
-        return f"{what}: {len(results.done)} scenes, done before"
-    total = len(results.done) + len(results.failed) + len(results.missing)
-    text = f"{what}: {len(results.done)} of {total} scenes"
-    if results.missing:
-        text += f"; {len(results.missing)} not found: {_some(results.missing)}"
-    if results.failed:
-        text += f"; {len(results.failed)} failed: {_some(list(results.failed))}"
-    return text
-
-
-def _some(names: Sequence[str], most: int = 8) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def draw(table: Table, found: Mapping[str, ByExperiment], path: Path) -> None:

@@ -18,8 +18,6 @@ from taichi_unifusion.files.labels import read_class_names
 from taichi_unifusion.results.record import read_record
 from taichi_unifusion.results.run_folder import RunFolder
 
-PUBLISHED = Path(__file__).resolve().parents[1] / "configs" / "paper.yaml"
-METHODS: dict[str, Path | None] = {"ours": None, "published": PUBLISHED}  # name -> configuration
 EVERY = 10  # "every 10th posed frame" (Sec. VI-E)
 WIDE, STRICT = THRESHOLDS  # [m] the paper's, and ours
 SAMPLES = 100_000  # points drawn from each surface (Sec. VI-D)
@@ -39,6 +37,33 @@ class Settings:
     device: str = "auto"
 
 
+POSES = {
+    "given": "at the recording's poses",
+    "internal": "at poses refined against the map (--tracking internal)",
+    "rgbd": "at poses tracked from all frames alone (--tracking rgbd)",
+}
+
+
+def mapped(settings: Settings) -> str:
+    """Which frames are mapped, and at which poses."""
+    return f"{_every(settings.every)} mapped {POSES[settings.tracking]}"
+
+
+def _every(count: int) -> str:
+    if count == 1:
+        return "every frame"
+    ending = "th" if count // 10 % 10 == 1 else {1: "st", 2: "nd", 3: "rd"}.get(count % 10, "th")
+    return f"every {count}{ending} frame"
+
+
+def _mapped_and_compared(settings: Settings) -> str:
+    between = [str(settings.every // 2 + i * settings.every) for i in range(3)]
+    return (
+        f"{mapped(settings)}; compared with frames that are not, those half-way between: "
+        f"{', '.join(between)} ..."
+    )
+
+
 @dataclass(frozen=True)
 class Experiment:
     """What is done with every scene."""
@@ -48,6 +73,7 @@ class Experiment:
     commands: Callable[[Scene, Path, Path | None, Settings], list[Command]]  # in a folder
     numbers: Callable[[Path], dict[str, Any]]  # from that folder
     settings: Settings = Settings()  # as published
+    said: Callable[[Settings], str] = mapped  # what is done, in words
     least_every: int = 1  # more where frames between those that are mapped are compared
     prepare: Callable[[Scene, Path], None] = lambda scene, folder: None
 
@@ -164,6 +190,7 @@ def _rendering_numbers(folder: Path) -> dict[str, Any]:
         "PSNR dB": result["psnr_db"],
         "SSIM": result["ssim"],
         "coverage %": 100 * result["coverage"],
+        "frames compared": [frame["index"] for frame in result["frames"]],
         **truth,
         **_sizes(folder),
     }
@@ -247,6 +274,7 @@ RENDERING = Experiment(
     _rendering_commands,
     _rendering_numbers,
     Settings(tracking="rgbd"),
+    _mapped_and_compared,
     least_every=2,
 )
 SCANNET_CLASSES = Experiment(

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from paper_experiments import Command, Experiment, Settings
+from paper_methods import Method
 from paper_scenes import Scene
 
 from taichi_unifusion.errors import UniFusionError
@@ -25,6 +26,7 @@ from taichi_unifusion.results.run_folder import RunFolder
 UNIFUSION = "import sys; from taichi_unifusion.cli.main import main; sys.exit(main())"
 STOPPED = 130  # exit code of a command that Ctrl-C ended
 LOG = "log.txt"
+UNKNOWN = "which frames were mapped at which poses was not kept"
 
 
 class SceneFailed(UniFusionError):
@@ -38,6 +40,7 @@ class Results:
     done: dict[str, dict[str, Any]] = field(default_factory=dict)  # name -> numbers
     failed: dict[str, str] = field(default_factory=dict)  # name -> why
     missing: tuple[str, ...] = ()  # on the list but not in the root
+    said: tuple[str, ...] = ()  # what was done, in words; several where earlier calls differ
     kept: bool = False  # of earlier calls alone: how many there should be is not known
 
 
@@ -45,23 +48,25 @@ def run_scenes(
     experiment: Experiment,
     scenes: Sequence[Scene],
     out: Path,
-    config: Path | None,
+    method: Method,
     settings: Settings,
     keep_maps: bool = False,
 ) -> Results:
     """Run what is not done yet; `out` is the experiment's folder under a method.
 
-    A scene is done if its file says that the same commands gave its numbers.
+    A scene is done if its file says that the same commands and configuration gave its numbers.
     """
-    results = Results()
+    said = experiment.said(settings)
+    results = Results(said=(said,))
     for number, scene in enumerate(scenes, start=1):
         folder, file = out / scene.key, out / f"{scene.key}.json"
         head = f"[{number}/{len(scenes)}] {scene.name}"
         try:
-            commands = experiment.commands(scene, folder, config, settings)
-            kept = _read_done(file, commands)
+            commands = experiment.commands(scene, folder, method.config, settings)
+            kept = _read_done(file, commands, method.digest)
             if kept is None:
                 kept = _run(experiment, scene, folder, commands, head)
+                kept |= {"configuration": method.digest, "said": said}
                 write_text(file, json.dumps(kept, indent=1) + "\n")
                 if not keep_maps:
                     shutil.rmtree(RunFolder(folder).map_folder, ignore_errors=True)
@@ -79,14 +84,19 @@ def read_results(out: Path) -> Results:
     for file in sorted(out.glob("*.json")):
         values = json.loads(file.read_text())
         results.done[values["scene"]] = values["numbers"]
+        said = values.get("said", UNKNOWN)
+        results.said += (said,) * (said not in results.said)
     return results
 
 
-def _read_done(file: Path, commands: Sequence[Command]) -> dict[str, Any] | None:
-    """The results of a scene; None where there are none of these commands."""
+def _read_done(
+    file: Path, commands: Sequence[Command], configuration: str | None
+) -> dict[str, Any] | None:
+    """The results of a scene; None where there are none of these commands and configuration."""
     try:
         values = json.loads(file.read_text())
-        return values if values["commands"] == list(map(_shown, commands)) else None
+        made_by = values["commands"], values.get("configuration")
+        return values if made_by == (list(map(_shown, commands)), configuration) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

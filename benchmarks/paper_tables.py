@@ -25,6 +25,7 @@ from paper_scenes import LISTS, read_list
 from taichi_unifusion.evaluation.segmentation import SegmentationResult, score_confusion
 
 NOTHING = "-"  # a cell where nothing was measured
+COUNTS = ("poses", "of frames")  # numbers of things
 # of an experiment's name, for one method
 ByExperiment = Mapping[str, Results]
 
@@ -125,8 +126,7 @@ TABLES: dict[str, Table] = {
     for table in (
         Table(
             "I",
-            "surface of the 312 validation scans of ScanNet, every 10th posed frame: accuracy, "
-            "completeness, F1 within 2.5 cm",
+            "surface of the 312 validation scans of ScanNet: accuracy, completeness, F1 within 2.5 cm",
             (SURFACE,),
             _surface_rows,
             (
@@ -141,15 +141,14 @@ TABLES: dict[str, Table] = {
         ),
         Table(
             "II",
-            "camera tracking on three sequences of TUM RGB-D, all frames: ATE RMSE",
+            "camera tracking on three sequences of TUM RGB-D: ATE RMSE [cm]",
             (TRACKING,),
             _tracking_rows,
             ("poses", "of frames", "tracking s"),
         ),
         Table(
             "III",
-            "rendered depth and colour of the eight scenes of Replica, tracked, every 10th frame "
-            "mapped: depth L1, PSNR",
+            "rendered depth and colour of the eight scenes of Replica: depth L1, PSNR",
             (RENDERING,),
             _rendering_rows,
             (
@@ -165,8 +164,8 @@ TABLES: dict[str, Table] = {
         ),
         Table(
             "V",
-            "zero-shot segmentation of ScanNet (20 classes) and S3DIS (13): mean IoU of seen, "
-            "unseen and all classes",
+            "zero-shot segmentation of ScanNet (20 classes) and S3DIS (13): mean IoU in per cent of "
+            "seen, unseen and all classes",
             (SCANNET_CLASSES, S3DIS_CLASSES),
             _mean_iou_rows,
             ("mean IoU %", "features map MB", "ms a frame"),
@@ -192,8 +191,11 @@ def more_rows(table: Table, found: Mapping[str, ByExperiment]) -> list[list[str]
     rows = []
     for method, by_experiment in found.items():
         for name, results in by_experiment.items():
-            values = (mean(column(results, title)) for title in table.more)
-            rows.append([method, name, str(len(results.done)), *map(cell, values)])
+            cells = (
+                cell(mean(column(results, title)), 0 if title in COUNTS else 2)
+                for title in table.more
+            )
+            rows.append([method, name, str(len(results.done)), *cells])
     return [["method", "experiment", "scenes", *table.more], *rows] if table.more else []
 
 
@@ -209,6 +211,7 @@ def summary(table: Table, found: Mapping[str, ByExperiment]) -> dict[str, Any]:
         "scenes": {
             method: {
                 name: {
+                    "said": list(results.said),
                     "done": results.done,
                     "failed": results.failed,
                     "missing": list(results.missing),

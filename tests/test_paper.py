@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -25,6 +26,7 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import paper  # noqa: E402
 import paper_experiments  # noqa: E402
+import paper_methods  # noqa: E402
 import paper_pictures  # noqa: E402
 import paper_runs  # noqa: E402
 import paper_scenes  # noqa: E402
@@ -154,6 +156,15 @@ def test_rendering_of_replica(tmp_path, here, mini, capsys):
     assert 0 < float(depth[1]) < 6 and float(color[1]) > 15
     assert here[1][:2] == ["evaluate", "rendering"] and here[2][3].endswith("office0_mesh.ply")
     assert "7 not found: office-1" in text and "mini (1 scene)" in text
+    said = (
+        "every 2nd frame mapped at the recording's poses; compared with frames that are not, those "
+        "half-way between: 1, 3, 5 ..."
+    )
+    assert f"Ours, replica-rendering: {said}." in text and "tracked" not in text
+    written = json.loads((tmp_path / "out" / "table_III.json").read_text())
+    written = written["scenes"]["mini"]["replica-rendering"]
+    assert written["said"] == [said]
+    assert written["done"]["office-0"]["frames compared"][:2] == [1, 3]
     assert cv2.imread(str(tmp_path / "out" / "table_III.png")).shape[0] == 2 * paper_pictures.HEIGHT
     # as the paper does it
     scene = paper_scenes.replica(root).scenes[0]
@@ -181,6 +192,8 @@ def test_tracking_on_tum(tmp_path, here, mini, capsys):
         (tmp_path / "out" / "tum-tracking" / "mini" / "fr3-office.json").read_text()
     )
     assert numbers["numbers"]["poses"] == numbers["numbers"]["of frames"] == 5
+    assert "ATE RMSE [cm]" in text and "| 5 | 5 |" in text  # poses are whole
+    assert "every 2nd frame mapped at poses tracked from all frames alone" in text
     assert FREIBURG3.size == (640, 480)
 
 
@@ -219,6 +232,8 @@ def test_classes_of_scannet_and_s3dis(tmp_path, here, mini, capsys):
     text = capsys.readouterr().out
     row = rows_of(text, "mini")[0]
     assert "scannet-classes: 1 scenes, done before" in text
+    assert "scannet-classes: every 2nd frame mapped" in text  # as the earlier call did it
+    assert "s3dis-classes: every frame mapped at the recording's poses" in text
     assert all(float(share) > 60 for share in row)  # that of ScanNet was kept
     assert (tmp_path / "out" / "s3dis-classes" / "mini" / "area_1-office_1" / "maps").is_dir()
 
@@ -308,10 +323,81 @@ def test_labels_of_a_room_are_read_past_its_one_bad_byte(tmp_path):
 
 
 def test_methods_are_named_or_files(tmp_path):
-    assert paper.method_of("ours") == ("ours", None)
-    assert paper.method_of("published")[1].name == "paper.yaml"
+    assert paper_methods.method_of("ours") == paper_methods.Method("ours")
+    assert paper_methods.method_of("published").config.name == "paper.yaml"
     with pytest.raises(UniFusionError, match="ours, published and FILE.yaml"):
-        paper.method_of("mine")
+        paper_methods.method_of("mine")
+
+
+def test_methods_of_one_name_are_refused(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "my.yaml").write_text("window: 1\n")
+    (tmp_path / "ours.yaml").write_text("window: 1\n")
+    a, b, ours = (str(tmp_path / name) for name in ("a/my.yaml", "b/my.yaml", "ours.yaml"))
+    assert [each.name for each in paper_methods.methods_of(["ours", a])] == ["ours", "my"]
+    for names, said in (
+        ([a, b], "would both be called 'my'"),
+        (["ours", "ours"], "would both be called 'ours'"),
+        ([ours], "'.*ours.yaml' would be called 'ours'"),
+    ):
+        with pytest.raises(InputError, match=said):
+            paper_methods.methods_of(names)
+
+
+def test_a_wrong_configuration_is_said_before_any_scene_runs(tmp_path, here, capsys):
+    root = write_tum_root(tmp_path / "tum", count=1)
+    (tmp_path / "wrong.yaml").write_text("widow: 1\n")
+    arguments = ["--methods", "ours", str(tmp_path / "wrong.yaml"), "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit, match="wrong.yaml: unknown key 'widow'.*did you mean 'window'"):
+        paper.main(["II", str(root), *arguments])
+    assert not here and not (tmp_path / "out").exists()
+
+
+def test_other_settings_in_the_same_file_are_another_experiment(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(paper_runs, "unifusion", lambda command, log: asked.append(command))
+    experiment = replace(paper_experiments.TRACKING, numbers=lambda folder: {"poses": 5})
+    scenes = paper_scenes.tum(write_tum_root(tmp_path / "tum", count=1)).scenes
+    file = tmp_path / "my.yaml"
+
+    def commands_run(text: str) -> int:
+        asked.clear()
+        file.write_text(text)
+        method = paper_methods.method_of(str(file))
+        out = tmp_path / "out"
+        done = paper_runs.run_scenes(experiment, scenes, out, method, experiment.settings).done
+        assert done == {"fr3/office": {"poses": 5}}
+        return len(asked)
+
+    assert [commands_run(text) for text in ("window: 1", "# one\nwindow: 1", "window: 2")] == [
+        *(2, 0, 2)
+    ]
+    # of files that earlier versions wrote the settings are not known
+    kept = tmp_path / "out" / "fr3-office.json"
+    values = json.loads(kept.read_text())
+    del values["configuration"]
+    kept.write_text(json.dumps(values))
+    assert commands_run("window: 2") == 2
+
+
+def test_two_roots_of_one_data_set_are_refused(tmp_path):
+    with pytest.raises(InputError, match="both taken for scannet-classes"):
+        paper.roots_by_experiment(paper_tables.TABLES["V"], [tmp_path / "a", tmp_path / "b"])
+
+
+@pytest.mark.parametrize(
+    ("every", "said"),
+    [
+        (1, "every frame mapped"),
+        (2, "every 2nd frame mapped"),
+        (11, "every 11th frame mapped"),
+        (23, "every 23rd frame mapped"),
+    ],
+)
+def test_frames_are_counted_in_words(every, said):
+    settings = paper_experiments.Settings(every=every, tracking="rgbd")
+    assert paper_experiments.mapped(settings) == f"{said} at {paper_experiments.POSES['rgbd'][3:]}"
 
 
 def test_bars_have_their_heights():
