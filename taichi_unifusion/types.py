@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from .errors import FrameError, InputError, PoseError, SizeMismatch, check_kind, shortened, strict
 from .geometry.camera import PinholeCamera
 from .geometry.checks import as_numbers, check_array, check_rigid
+from .geometry.image_view import ColorView, ImageView
 from .geometry.triangles import used_vertices
 
 
@@ -30,36 +31,6 @@ def largest_magnitude(values: NDArray[np.float32]) -> float:
         return largest
     finite = values[np.isfinite(values)]
     return float(np.abs(finite).max()) if len(finite) else 0.0
-
-
-@dataclass(frozen=True)
-class ImageView:
-    """An image, depth or features, and where it was taken from."""
-
-    values: NDArray[np.float32]  # (h, w) or (h, w, c)
-    camera: PinholeCamera  # of this image: w x h
-    # (4, 4) from the points that it belongs to
-    T_camera_cloud: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-
-    def __post_init__(self) -> None:
-        if self.values.ndim not in (2, 3) or self.values.dtype != np.float32:
-            raise FrameError(
-                f"image: must be (h, w) or (h, w, c) float32, got {self.values.shape} "
-                f"{self.values.dtype}"
-            )
-        if self.values.shape[1::-1] != self.camera.size:
-            raise SizeMismatch(
-                f"image: is {self.values.shape[1]}x{self.values.shape[0]} but its camera is "
-                f"{self.camera.width}x{self.camera.height}"
-            )
-        object.__setattr__(self, "values", np.ascontiguousarray(self.values))  # as kernels take it
-        object.__setattr__(
-            self, "T_camera_cloud", check_rigid(self.T_camera_cloud, "T_camera_cloud")
-        )
-
-    def transformed(self, T_b_a: NDArray) -> ImageView:
-        """The same image for points that were given in frame a and now are in frame b."""
-        return replace(self, T_camera_cloud=self.T_camera_cloud @ np.linalg.inv(T_b_a))
 
 
 @strict
@@ -81,6 +52,7 @@ class Frame:
     apart: bool = False
     # (H, W) uint8 halves of a pixel that each reading counts in the maps' sums, from 1; None: 2, whole ones
     weights: NDArray[np.uint8] | None = None
+    color_view: ColorView | None = None  # whose image colour was, before it was registered to depth
 
     def __post_init__(self) -> None:
         at = self.label
@@ -187,16 +159,19 @@ class Frame:
             self, images={key: image for key, image in self.images.items() if key != name}
         )
 
-    def with_features(self, name: str, values: NDArray) -> Frame:
-        """A copy that also carries the feature image `name`, (h, w, c), of the same view at any
-        resolution.
+    def with_features(self, name: str, values: NDArray, view: ColorView | None = None) -> Frame:
+        """A copy that also carries the feature image `name`, (h, w, c) at any resolution, of its own view
+        or of another one.
         """
         values = as_numbers(f"{self.label}: features '{name}'", values)
         if values.ndim != 3:
             raise FrameError(
                 f"{self.label}: features '{name}' must be (h, w, c), got {values.shape}"
             )
-        image = ImageView(values, self.camera.resized(values.shape[1], values.shape[0]))
+        if view is None:
+            image = ImageView(values, self.camera.resized(values.shape[1], values.shape[0]))
+        else:
+            image = view.image(values)
         return replace(self, features={**self.features, name: image})
 
 

@@ -38,7 +38,11 @@ class Understand(Reconstruct):
     patch: Annotated[int, arg(metavar="PIXELS")] = field(default=16, kw_only=True)
     """onnx: edge of a patch, for networks that give one feature a patch."""
     layout: Literal["auto", "hwc", "chw"] = field(default="auto", kw_only=True)
-    """folder: order of height, width and channels in the files."""
+    """folder: order of height, width and channels in the files; auto tells by the image's shape."""
+    feature_images: Literal["recorded", "registered"] = field(default="recorded", kw_only=True)
+    """folder: whether the features were made of colour images as they were recorded, or as they were
+    registered to depth. It matters where a colour camera of its own was found or given.
+    """
     download: FlagCreatePairsOff[bool] = field(default=False, kw_only=True)
     """Allow a CLIP model to be fetched from the Hugging Face hub; without it only what lies on this
     machine is used.
@@ -58,7 +62,7 @@ class Understand(Reconstruct):
                 "device": device,
             },
             "onnx": {"patch": self.patch, "device": device},
-            "folder": {"layout": self.layout},
+            "folder": {"layout": self.layout, "images": self.feature_images},
         }.get(self.features.partition(":")[0], {})
         return EncoderChoice(self.features, choices)
 

@@ -17,6 +17,7 @@ from ..errors import DatasetError, InputError, SizeMismatch
 from ..files.atomic import write_text
 from ..files.images import SAME_ASPECT
 from ..geometry import se3
+from ..geometry.image_view import ColorView
 from ..types import Frame, PinholeCamera, check_rigid
 from .depth_camera import make_camera
 from .depth_registration import LensCamera, color_for_depth
@@ -62,15 +63,16 @@ class ColorCamera:
         SizeMismatch, naming `where`, for an image of another shape than this camera's.
         """
         height, width = color.shape[:2]
-        lens = self.resized(width, height, where).lens
+        resized = self.resized(width, height, where)
         T_color_depth = self.T_color_depth
         if velocity is not None:
             T_color_depth = T_color_depth @ se3.exp(-self.clock_offset * velocity)
-        whole, seen = color_for_depth(color, lens, frame.depth, frame.camera, T_color_depth)
+        whole, seen = color_for_depth(color, resized.lens, frame.depth, frame.camera, T_color_depth)
         known = whole.astype(np.float32)
         known /= np.float32(255)
         known[~seen] = np.nan
-        return replace(frame, color=whole).with_image("color", known)
+        view = ColorView(resized.pinhole, T_color_depth, self.distortion)
+        return replace(frame, color=whole, color_view=view).with_image("color", known)
 
     def resized(self, width: int, height: int, where: str) -> ColorCamera:
         """The same camera for its images resampled to another size."""

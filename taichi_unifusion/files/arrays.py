@@ -19,7 +19,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, InputError, MissingDependency, UniFusionError
+from ..errors import FileError, InputError, MissingDependency, UniFusionError, shortened
 from .atomic import check_name, file_error
 
 POINT_FEATURES = ("feat", "mask_full")  # names in OpenScene's files
@@ -244,12 +244,15 @@ def read_point_features(
     if path.suffix == ".pt":
         stored = _load_torch(path)
         if isinstance(stored, dict):
-            values = [stored[name] for name in POINT_FEATURES if hasattr(stored.get(name), "numpy")]
-            if len(values) < len(POINT_FEATURES):
-                raise InputError(f"{path}: expected tensors {' and '.join(POINT_FEATURES)} in it")
-            features, mask = (value.numpy() for value in values)
+            tensors = {key: _in_numpy(each) for key, each in stored.items() if _is_tensor(each)}
+            if not set(POINT_FEATURES) <= set(tensors):
+                raise InputError(
+                    f"{path}: expected tensors {' and '.join(POINT_FEATURES)} in it, found "
+                    f"{shortened(', '.join(map(str, tensors)) or 'none')}"
+                )
+            features, mask = (tensors[name] for name in POINT_FEATURES)
         else:
-            features = stored.numpy() if hasattr(stored, "numpy") else None
+            features = _in_numpy(stored) if _is_tensor(stored) else None
     elif path.suffix == ".npz":
         features, mask = read_archive(path, POINT_FEATURES).values()
     else:
@@ -287,8 +290,19 @@ def _load_torch(path: Path) -> Any:
         raise FileError(f"{path}: no such file")
     try:
         return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # noqa: BLE001 - torch has a class of its own for every kind
-        line = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
+    except Exception:  # noqa: BLE001 - torch has a class of its own for every kind
+        why = "it holds more than plain tensors, whose reading could run code, or is damaged"
+        if not zipfile.is_zipfile(path):
+            why = "it is damaged, or from before torch 1.6"
         raise FileError(
-            f"{path}: not a tensor that torch reads safely, without running code ({line})"
+            f"{path}: torch does not read it as tensors: {why}; save the tensors alone, with torch.save"
         ) from None
+
+
+def _is_tensor(value: Any) -> bool:
+    return hasattr(value, "numpy")
+
+
+def _in_numpy(tensor: Any) -> NDArray[Any]:
+    """A tensor of torch as an array; what NumPy has no type for in single precision."""
+    return (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()

@@ -13,7 +13,9 @@ FEATURES = "features"  # of the map, if nothing else is said
 
 @dataclass(frozen=True)
 class FeatureSource:
-    """Features of every frame's image, for a map of their name."""
+    """Features of every frame's image, for a map of their name; of its colour image as it was recorded
+    where the encoder is `recorded`.
+    """
 
     encoder: ImageEncoder
     settings: FeatureSettings = field(default_factory=FeatureSettings)
@@ -21,7 +23,9 @@ class FeatureSource:
 
     def add_to(self, frame: Frame) -> Frame:
         """The frame with its features; raises FrameError where it has none."""
-        return frame.with_features(self.name, feature_image(self.encoder, frame))
+        recorded = getattr(self.encoder, "recorded", False)
+        view = frame.color_view if recorded else None
+        return frame.with_features(self.name, feature_image(self.encoder, frame), view)
 
     def make_map(self, frame: Frame) -> FeatureMap:
         """An empty map for the features of such a frame, which say how many channels there are."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import zipfile
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -102,6 +104,8 @@ def test_files_that_do_not_fit_are_said(scan, tmp_path):
 class Tensor:
     """As much of a tensor as is used."""
 
+    dtype = "torch.float32"
+
     def __init__(self, array: np.ndarray) -> None:
         self.array = array
 
@@ -125,8 +129,49 @@ def test_X2_files_of_torch_are_read_without_running_code(scan, tmp_path, monkeyp
         assert (found == features).all() and (which == mask).all()
     assert asked["weights_only"] is True
     stored = {"feat": Tensor(features)}
-    with pytest.raises(InputError, match="feat and mask_full"):
+    with pytest.raises(InputError, match="feat and mask_full in it, found .feat"):
         read_point_features(tmp_path / "scan_0.pt")
+
+
+class Half(Tensor):
+    """Of a type that NumPy has not."""
+
+    dtype = "torch.bfloat16"
+
+    def float(self) -> Tensor:
+        return Tensor(self.array)
+
+    def numpy(self) -> np.ndarray:
+        raise TypeError("Got unsupported ScalarType BFloat16")
+
+
+def test_what_torch_refuses_is_one_sentence_of_ours(scan, tmp_path, monkeypatch):
+    _, _, features, mask = scan
+
+    def load(path, **options):
+        if zipfile.is_zipfile(path):
+            return {"feat": Half(features), "mask_full": Tensor(mask)}
+        raise RuntimeError("PytorchStreamReader failed: \x1b[1mmore of torch's words")
+
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(load=load))
+    file = tmp_path / "scan_0.pt"
+    file.write_bytes(b"cut")
+    with pytest.raises(FileError, match="damaged, or from before torch 1.6; save") as raised:
+        read_point_features(file)
+    assert "\x1b" not in str(raised.value)
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("data.pkl", b"")
+    assert (read_point_features(file)[0] == features).all()
+
+
+class Payload:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self):
+        return Path.touch, (self.marker,)
 
 
 def test_real_files_of_torch(scan, tmp_path):
@@ -136,3 +181,20 @@ def test_real_files_of_torch(scan, tmp_path):
     torch.save(stored, tmp_path / "scan_0.pt")
     found, which = read_point_features(tmp_path / "scan_0.pt")
     assert (found == features).all() and (which == mask).all()
+    stored["feat"] = stored["feat"].to(torch.bfloat16)
+    torch.save(stored, tmp_path / "scan_0.pt")
+    assert np.abs(read_point_features(tmp_path / "scan_0.pt")[0] - features).max() < 0.01
+    marker = tmp_path / "was-run"
+    for stem, told, save in (
+        ("payload", "could run code", lambda file: torch.save(Payload(marker), file)),
+        ("cut", "damaged", lambda file: file.write_bytes(b"PK" + bytes(100))),
+        (
+            "old",
+            "before torch 1.6",
+            lambda file: torch.save(stored, file, _use_new_zipfile_serialization=False),
+        ),
+    ):
+        save(tmp_path / f"{stem}.pt")
+        with pytest.raises(FileError, match=told):
+            read_point_features(tmp_path / f"{stem}.pt")
+    assert not marker.exists()
