@@ -16,7 +16,7 @@ from ..results.tables import format_table
 from .options import TextOptions
 from .results_source import holds_folder
 from .terminal import report
-from .texts import make_encoder, templates_of
+from .texts import check_fits, make_encoder, templates_of
 
 if TYPE_CHECKING:
     from ..errors import InputError
@@ -69,7 +69,7 @@ def query(options: Query) -> int:
     from ..errors import InputError
 
     if options.list_names:
-        print("\n".join(_names(options)))
+        print(_names(options))
         return 0
     if not options.texts:
         raise InputError(
@@ -114,17 +114,28 @@ def query(options: Query) -> int:
     return report(writer.failures)
 
 
-def _names(options: Query) -> list[str]:
-    """Of the embeddings file asked for, each with its synonyms; InputError for another encoder."""
+def _names(options: Query) -> str:
+    """What can be asked with the embeddings file given, each name with its synonyms, as lines or JSON;
+    raises InputError for another encoder, or where its vectors do not fit the map of features.
+    """
     from ..errors import InputError
+    from ..language import TEXT_ENCODERS
     from ..language.embeddings import TextEmbeddings
+    from ..results.understood import describe_features
 
-    encoder = make_encoder(options.encoder, "", options.dir)
-    if not isinstance(encoder, TextEmbeddings):
+    features = describe_features(options.dir)
+    text = options.encoder.text or features.source
+    if (kind := text.partition(":")[0]) in TEXT_ENCODERS and kind != "embeddings":
         raise InputError(
-            f"query: {encoder.name} takes any text; --list-names is for --text embeddings:FILE"
+            f"query: {text} takes any text; --list-names is for --text embeddings:FILE"
         )
-    return encoder.listing()
+    encoder = make_encoder(options.encoder, features.source, options.dir)
+    assert isinstance(encoder, TextEmbeddings)
+    check_fits(encoder, features, options.dir)
+    listing = encoder.listing()
+    if options.encoder.json:
+        return json.dumps([{"name": name, "synonyms": other} for name, other in listing], indent=2)
+    return "\n".join(f"{name}: {', '.join(other)}" if other else name for name, other in listing)
 
 
 def split_known(

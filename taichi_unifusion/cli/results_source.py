@@ -55,14 +55,12 @@ def _can_encode(path: Path, text: str | None) -> bool:
     """Whether questions can be put to a results folder: it holds features, and there is an encoder
     for the words.
     """
-    from ..maps.settings import FeatureSettings
     from ..maps.stored import read_description
 
     features = RunFolder(path).features
     if not features.exists():
         return False
-    settings = read_description(features).settings
-    source = settings.source if isinstance(settings, FeatureSettings) else ""
+    source = read_description(features).source
     if text is None and not source.startswith("clip:"):
         logger.info(
             "%s: holds features of %s; to ask, give the text encoder that belongs to them, with --text",

@@ -68,16 +68,13 @@ class TextEmbeddings:
         words = " or ".join(f"'{name}'" for name in near[:2])
         return f" (did you mean {words}?)" if words else ""
 
-    def listing(self) -> list[str]:
-        """Every name, followed by what else finds it: 'sofa: couch, lounge'."""
+    def listing(self) -> list[tuple[str, tuple[str, ...]]]:
+        """Every name, and what else finds it: ('sofa', ('couch', 'lounge'))."""
         others: dict[int, list[str]] = {}
         for word, row in self.synonyms.items():
             if _plain(word) != _plain(self.names[row]):
                 others.setdefault(row, []).append(word)
-        return [
-            f"{name}: {', '.join(sorted(others[row]))}" if row in others else name
-            for row, name in enumerate(self.names)
-        ]
+        return [(name, tuple(sorted(others.get(row, ())))) for row, name in enumerate(self.names)]
 
     def has(self, text: str) -> bool:
         """Whether there is a vector for the text."""

@@ -89,6 +89,11 @@ class MapDescription:
         """What such a map holds of a voxel beside its key."""
         return KINDS[self.kind].fields(self.channels, self.settings)
 
+    @property
+    def source(self) -> str:
+        """What made the features of a map of them, as far as that is known; "" for other maps."""
+        return self.settings.source if isinstance(self.settings, FeatureSettings) else ""
+
 
 def read_description(path: str | os.PathLike[str]) -> MapDescription:
     """What a map file says about itself, checked with the sizes of its tensors, or what the index of

@@ -10,6 +10,7 @@ from ..errors import FileError, InputError
 from ..files.mesh_reading import read_mesh
 from ..files.trajectories import read_trajectory
 from ..maps.by_tiles import Features, open_features
+from ..maps.stored import MapDescription, read_description
 from ..types import Mesh, Trajectory
 from .outlook import Outlook, read_outlook
 from .run_folder import RunFolder
@@ -25,16 +26,28 @@ class Understood:
     outlook: Outlook
 
 
+def describe_features(directory: Path) -> MapDescription:
+    """What the map of features of a results folder says about itself, without reading the map; raises
+    FileError where there is none, MapCorrupt where it makes no sense.
+    """
+    return read_description(_find_features(RunFolder(directory)))
+
+
+def _find_features(folder: RunFolder) -> Path:
+    if not folder.features.exists():
+        raise FileError(
+            f"{folder.path}: no {folder.relative(folder.features)} here; give the results folder of "
+            "`unifusion understand`"
+        )
+    return folder.features
+
+
 def read_understood(directory: Path, device: str) -> Understood:
     """Mesh, map of features and trajectory of a results folder; raises FileError where one is
     missing or damaged.
     """
     folder = RunFolder(directory)
-    if not folder.features.exists():
-        raise FileError(
-            f"{directory}: no {folder.relative(folder.features)} here; give the results folder of "
-            "`unifusion understand`"
-        )
+    features = _find_features(folder)
     if not folder.mesh.exists():
         raise FileError(
             f"{directory}: no {folder.mesh.name} here; `unifusion mesh {directory}` makes it again"
@@ -46,7 +59,7 @@ def read_understood(directory: Path, device: str) -> Understood:
     poses = folder.trajectory
     return Understood(
         mesh,
-        open_features(folder.features),
+        open_features(features),
         read_trajectory(poses) if poses.exists() else None,
         read_outlook(folder, mesh),
     )

@@ -145,6 +145,25 @@ def test_what_is_not_found_leaves_no_mesh_and_what_is_unknown_does_not_cost_the_
 def test_the_names_of_an_embeddings_file_are_listed(made, embeddings, capsys):
     assert ask(made, embeddings, "query", "--list-names") == 0
     assert capsys.readouterr().out.split() == list(NAMES)
+    assert ask(made, embeddings, "query", "--list-names", "--json") == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert listed == [{"name": name, "synonyms": []} for name in NAMES]
+
+
+def test_names_are_listed_only_where_they_can_be_asked(
+    made, recording, embeddings, tmp_path, capsys
+):
+    np.savez(tmp_path / "wide.npz", names=NAMES, vectors=np.eye(3, 5))
+    for folder, text, told in (
+        (made, None, f"its features come from {recording / 'clip'}; give the text encoder"),
+        (tmp_path / "none", f"embeddings:{embeddings}", "no maps/features.safetensors"),
+        (made, f"embeddings:{tmp_path / 'wide.npz'}", f"5 channels, the features of {made} have 3"),
+        (made, "clip:nowhere", "clip:nowhere takes any text"),
+    ):
+        arguments = ["query", str(folder), "--list-names", *(("--text", text) if text else ())]
+        assert cli.main(arguments) == 2
+        said = capsys.readouterr()
+        assert told in said.err and not said.out
 
 
 def test_segmentation_names_every_vertex_and_measures_itself(made, embeddings, tmp_path, capsys):
