@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -10,6 +10,7 @@ from typing import TypeVar
 from ..errors import FileError, MapCorrupt, UniFusionError
 from ..files.mesh_reading import read_any_mesh
 from ..files.tiles import TileFolder, map_bytes
+from ..maps.settings import FeatureSettings
 from ..maps.stored import MapDescription, describe_tiles, read_stored, read_tile
 from ..maps.tile_places import code_of, key_codes
 from .lock import who_writes
@@ -60,22 +61,25 @@ def inspect(path: Path) -> Inspection:
             problems.append(error)
             return None
 
-    rows = [row for row in (attempt(_describe_map, file) for file in maps) if row]
+    checked = {file: attempt(_checked, file) for file in maps}
+    stored = {file: each for file, each in checked.items() if each}
+    rows = [_describe_map(file, each) for file, each in stored.items()]
     texts = [
         format_table([MAP_COLUMNS, *rows]) if rows else None,
+        _describe_features(list(stored.values())),
         attempt(_describe_mesh, mesh),
         attempt(_describe_run, record),
     ]
     if path.is_dir():
-        texts += [attempt(_describe_unfinished, RunFolder(path).state)]
+        texts.append(_describe_answers(RunFolder(path)))
+        texts.append(attempt(_describe_unfinished, RunFolder(path).state))
         texts.append(_describe_writer(RunFolder(path)))
         problems += _find_mixed(RunFolder(path))
     return Inspection("\n\n".join(text for text in texts if text), tuple(problems))
 
 
-def _describe_map(file: Path) -> list[str]:
-    """A row of MAP_COLUMNS, after everything was checked that loading the map would."""
-    stored = _checked(file)
+def _describe_map(file: Path, stored: MapDescription) -> list[str]:
+    """A row of MAP_COLUMNS."""
     settings, encoder = stored.settings, stored.settings.encoder
     return [
         stored.name,
@@ -89,8 +93,31 @@ def _describe_map(file: Path) -> list[str]:
     ]
 
 
+def _describe_features(maps: Sequence[MapDescription]) -> str | None:
+    """Where image-text features come from, and which text encoder belongs to them."""
+    sources = dict.fromkeys(
+        each.source for each in maps if isinstance(each.settings, FeatureSettings)
+    )
+    lines = []
+    for source in sources:
+        if source.startswith("clip:"):
+            texts = f"the text encoder of {source}, which `query` takes unless told otherwise"
+        else:
+            texts = "that of the network that made them: `query DIR TEXT --text ENCODER`"
+        lines.append(f"features from {source or 'an unknown network'}; text encoder: {texts}")
+    return "\n".join(lines) or None
+
+
+def _describe_answers(folder: RunFolder) -> str | None:
+    """The files of questions that were put to the maps."""
+    files = ", ".join(map(folder.relative, folder.asked))
+    return f"answers {files}" if files else None
+
+
 def _checked(file: Path) -> MapDescription:
-    """What a map is, all of whose voxels make sense; of one in tiles one tile is read at a time."""
+    """What a map is, once everything was checked that loading it would; of one in tiles one tile is read
+    at a time.
+    """
     if not TileFolder.is_one(file):
         return read_stored(file)[0]
     folder = TileFolder.open(file)

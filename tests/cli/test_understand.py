@@ -12,6 +12,7 @@ from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 
 from taichi_unifusion import Pipeline, load_map
 from taichi_unifusion.cli import main as cli
+from taichi_unifusion.files.maps import read_map, write_map
 from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.maps import FeatureMap
 from taichi_unifusion.results import write_results
@@ -194,6 +195,30 @@ def test_segmentation_names_every_vertex_and_measures_itself(made, embeddings, t
     assert ask(made, embeddings, *arguments) == 0
     out = capsys.readouterr().out
     assert "of the points are right" in out and "segmentation.ply" in out
+
+
+def test_info_says_where_features_come_from_and_which_answers_there_are(
+    made, recording, embeddings, tmp_path, capsys
+):
+    copy = shutil.copytree(made, tmp_path / "copy")
+    for file in RunFolder(copy).asked:
+        file.unlink()
+    source = f"features from {recording / 'clip'}; text encoder: that of the network"
+    assert cli.main(["info", str(copy)]) == 0
+    said = capsys.readouterr().out
+    assert source in said and "answers" not in said
+    assert ask(copy, embeddings, "query", "red", "--threshold", "0.4") == 0
+    features = copy / "maps" / "features.safetensors"
+    tensors, manifest = read_map(features)
+    settings = {**manifest["settings"], "source": "clip:somebody/vit"}
+    write_map(features, tensors, {**manifest, "settings": settings})
+    capsys.readouterr()
+    cli.main(["info", str(copy)])  # says that the map is not the run's
+    said = capsys.readouterr().out
+    assert "answers query-red.ply, query-red.png, query.json" in said
+    assert "the text encoder of clip:somebody/vit, which `query` takes" in said
+    assert cli.main(["info", str(features)]) == 0
+    assert "the text encoder of clip:somebody/vit" in capsys.readouterr().out
 
 
 def test_a_finer_mesh_is_still_extracted_beside_features(made, tmp_path):
