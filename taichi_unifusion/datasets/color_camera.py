@@ -71,7 +71,7 @@ class ColorCamera:
         known = whole.astype(np.float32)
         known /= np.float32(255)
         known[~seen] = np.nan
-        view = ColorView(resized.pinhole, T_color_depth, self.distortion)
+        view = ColorView(resized.pinhole, T_color_depth, resized.lens.distortion)
         return replace(frame, color=whole, color_view=view).with_image("color", known)
 
     def resized(self, width: int, height: int, where: str) -> ColorCamera:

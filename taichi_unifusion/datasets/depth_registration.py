@@ -133,8 +133,34 @@ def color_for_depth(
     It does not where the point lies outside its image or behind something nearer. Pixels without a
     reading are coloured as if they had their neighbours', so that the picture is whole.
     """
+    columns, rows, seen = places_in(lens, depth, camera, T_color_camera)
+    moved = cv2.remap(color, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return np.asarray(moved, np.uint8), seen
+
+
+def values_for_depth(
+    values: NDArray[np.float32],
+    lens: LensCamera,
+    depth: NDArray[np.float32],
+    camera: PinholeCamera,
+    T_lens_camera: NDArray,
+) -> NDArray[np.float32]:
+    """Values (H, W, c) for every reading of a depth image, of an image (h, w, c) of another camera beside
+    it; NaN where that does not see the point.
+    """
+    columns, rows, seen = places_in(lens, depth, camera, T_lens_camera)
+    moved = [cv2.remap(each, columns, rows, cv2.INTER_LINEAR) for each in cv2.split(values)]
+    return np.where(seen[..., None], np.stack(moved, axis=2), np.float32(np.nan))
+
+
+def places_in(
+    lens: LensCamera, depth: NDArray[np.float32], camera: PinholeCamera, T_lens_camera: NDArray
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Column and row in another camera's image of every pixel of a depth image, and whether that camera
+    sees the point of a reading, each (H, W). Pixels without a reading take their neighbours'.
+    """
     target = lens.pinhole
-    columns, rows, z = project_depth(_filled(depth), camera, target, T_color_camera)
+    columns, rows, z = project_depth(_filled(depth), camera, target, T_lens_camera)
     width, height = target.size
     # the outermost pixels count as outside: interpolation mixes them with black
     inside = (columns > 0.5) & (rows > 0.5) & (columns < width - 1.5) & (rows < height - 1.5)
@@ -144,9 +170,8 @@ def color_for_depth(
             for each in _undistortion(lens, target)
         )
         inside &= (columns > 0.5) & (rows > 0.5) & (columns < width - 1.5) & (rows < height - 1.5)
-    seen = inside & (depth > 0) & _in_front(columns, rows, z, inside & (depth > 0), camera, target)
-    moved = cv2.remap(color, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    return np.asarray(moved, np.uint8), seen
+    known = inside & (depth > 0)
+    return columns, rows, known & _in_front(columns, rows, z, known, camera, target)
 
 
 def _in_front(

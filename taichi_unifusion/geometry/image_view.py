@@ -49,7 +49,7 @@ class ColorView:
 
     camera: PinholeCamera  # of the image as recorded
     T_color_depth: NDArray[np.float64]  # (4, 4) [m]
-    distortion: tuple[float, ...] = ()  # as OpenCV has it
+    distortion: tuple[float, ...] = ()  # as OpenCV has it: none, 4, 5 or 8 numbers
 
     def image(self, values: NDArray[np.float32]) -> ImageView:
         """What was made of the recorded image, (h, w, c) at any resolution, without its distortion; NaN

@@ -116,7 +116,7 @@ def _layout_of(shape: Sequence[int], aspect: float | None) -> Literal["hwc", "ch
     square that it was made to; where that does not tell, the one whose channels are usual.
     """
     for wanted in (aspect, 1.0):
-        hwc, chw = (_has_aspect(*sides, wanted) for sides in (shape[:2], shape[1:]))
+        hwc, chw = (_has_aspect(h, w, wanted) for h, w in (shape[:2], shape[1:]))
         if hwc != chw:
             return "hwc" if hwc else "chw"
     return "chw" if shape[0] in USUAL_CHANNELS and shape[2] not in USUAL_CHANNELS else "hwc"
