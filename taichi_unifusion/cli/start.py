@@ -4,6 +4,7 @@ the same in every command.
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -15,6 +16,7 @@ INTERRUPTED = 130  # exit code
 def main() -> int:
     """Run the command line of this process and return its exit code."""
     open_what_is_closed()
+    atexit.register(_hear_no_more)  # runs last
     asked: list[int] = []  # signals that came
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -42,6 +44,12 @@ def main() -> int:
         if callable(signal.getsignal(number)):
             signal.signal(number, end)
     return code
+
+
+def _hear_no_more() -> None:
+    """Once Python takes itself apart it hears no signals, and one would end the process by itself."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
 
 
 def open_what_is_closed() -> None:

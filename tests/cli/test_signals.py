@@ -62,6 +62,15 @@ class Slow:
 sys.meta_path.insert(0, Slow())
 """
 AT_THE_END = "import atexit\natexit.register(wait)"
+# Python hears no signals any more when it takes modules apart
+TAKEN_APART = """
+class Last:
+    def __del__(self, write=__import__("os").write, sleep=time.sleep):
+        write(2, b"now\\n")
+        sleep(2)
+sys.modules["last"] = type(sys)("last")
+sys.modules["last"].last = Last()
+"""
 WRITING = """
 from taichi_unifusion.files import atomic
 atomic._flush_to_disk = lambda path: wait()
@@ -101,8 +110,8 @@ def signalled(moment: str, number: signal.Signals, *arguments: str) -> tuple[int
 @pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize(
     ("moment", "code"),
-    [(IMPORTING, 130), (COMPILED, 130), (AT_THE_END, 0)],
-    ids=["imports", "compiled", "end"],
+    [(IMPORTING, 130), (COMPILED, 130), (AT_THE_END, 0), (TAKEN_APART, 0)],
+    ids=["imports", "compiled", "end", "taken apart"],
 )
 def test_c16_R3_R4_signals_at_the_edges_are_no_traceback(number, moment, code):
     ended, said = signalled(moment, number, "--version")
