@@ -124,9 +124,12 @@ def _import_sdk() -> ModuleType:
     try:
         import pyrealsense2  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        missing = f" ({error})" if "libusb" in str(error) else ""
+        if "libusb" in str(error):
+            raise MissingDependency(
+                "pyrealsense2 needs the system library libusb-1.0; run: apt-get install -y libusb-1.0-0"
+            ) from None
         raise MissingDependency(
-            f"a RealSense camera needs the SDK{missing}: pip install 'taichi-unifusion[realsense]'"
+            "a RealSense camera needs the SDK: pip install 'taichi-unifusion[realsense]'"
         ) from None
     return pyrealsense2
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
 import time
 
@@ -289,4 +290,25 @@ def test_without_a_camera_one_sentence_says_so(tmp_path):
     with pytest.raises(
         (DatasetError, MissingDependency), match="no camera is connected|needs the SDK"
     ):
+        RealsenseCamera()
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        ("libusb-1.0.so.0: cannot open shared object file", "apt-get install -y libusb-1.0-0"),
+        ("No module named 'pyrealsense2'", r"pip install 'taichi-unifusion\[realsense\]'"),
+    ],
+)
+def test_what_the_sdk_of_a_realsense_lacks_is_said(monkeypatch, error, told):
+    from taichi_unifusion.datasets.realsense_camera import RealsenseCamera
+
+    class Lacking:
+        def find_spec(self, name, path=None, target=None):
+            if name == "pyrealsense2":
+                raise ImportError(error)
+
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Lacking(), *sys.meta_path])
+    with pytest.raises(MissingDependency, match=told):
         RealsenseCamera()
