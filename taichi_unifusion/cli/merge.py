@@ -133,7 +133,7 @@ def _check_worlds(folders: list[RunFolder], known: bool) -> None:
     for folder in folders:
         record = read_record(folder.record) if folder.record.exists() else None
         tracking = (record and record.tracking) or {}
-        if tracking.get("mode") == "rgbd" and "joined" not in tracking:
+        if tracking.get("mode") == "rgbd" and not {"joined", "reposed"} & set(tracking):
             own.append(folder.path)
     if own and not known and len(folders) > 1:
         raise InputError(

@@ -72,6 +72,7 @@ def _move(folder: RunFolder, windows, poses: NewPoses, device: Device) -> Repose
     from .. import runtime
     from ..files.trajectories import write_trajectory
     from ..results.keyframes import repose_keyframes
+    from ..results.reposing import record_reposed
     from ..results.reposing import repose as reposed
 
     runtime.init(device)
@@ -81,6 +82,7 @@ def _move(folder: RunFolder, windows, poses: NewPoses, device: Device) -> Repose
             each.save(folder.map(name))
         write_trajectory(folder.trajectory, poses.trajectory)
         repose_keyframes(folder, poses)
+        record_reposed(folder, poses)
         folder.new_windows.replace(folder.windows)
     finally:
         folder.new_windows.unlink(missing_ok=True)

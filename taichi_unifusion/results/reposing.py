@@ -5,13 +5,14 @@ says that they belong.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, InputError
+from ..evaluation.trajectory import align_poses
 from ..geometry.se3 import distance, inverse, normalized
 from ..geometry.time_stamps import nearest
 from ..maps import BaseMap, load_map
@@ -23,6 +24,7 @@ from ..maps.window_store import WindowStore
 from ..tracking.trajectory_files import read_poses
 from ..types import Trajectory
 from .reader import read_run
+from .record import read_record, write_record
 from .run_folder import RunFolder
 
 MAX_DIFFERENCE = 0.02  # [s] between a frame and its new pose
@@ -35,6 +37,8 @@ class NewPoses:
     by_frame: Mapping[int, NDArray[np.float64]]  # every frame of the run
     given: int  # frames that the trajectory has a pose for; others move as the nearest that has
     trajectory: Trajectory  # of the frames used
+    T_new_old: NDArray[np.float64]  # (4, 4) of worlds, in the mean
+    file: Path  # that says so
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,28 @@ def read_new_poses(folder: RunFolder, file: Path) -> NewPoses:
     T = normalized(motion @ before.T_world_camera)
     T[known] = found.T_world_camera[rows[known]]
     by_frame = dict(zip(frames.tolist(), T, strict=True))
-    return NewPoses(by_frame, int(known.sum()), Trajectory(before.timestamps, T))
+    return NewPoses(
+        by_frame,
+        int(known.sum()),
+        Trajectory(before.timestamps, T),
+        align_poses(before.T_world_camera, T),
+        file,
+    )
+
+
+def record_reposed(folder: RunFolder, poses: NewPoses) -> None:
+    """Say in the record of the run whose poses it has now, and which way is up among these."""
+    record = read_record(folder.record)
+    up = None if record.T_up_world is None else record.T_up_world @ inverse(poses.T_new_old)
+    write_record(
+        folder.record,
+        replace(
+            record,
+            tracking={**(record.tracking or {"mode": "given"}), "reposed": str(poses.file)},
+            T_up_world=None if up is None else tuple(map(tuple, up.tolist())),
+            views=(),
+        ),
+    )
 
 
 def repose(folder: RunFolder, windows: WindowStore, poses: NewPoses) -> tuple[Refusing, Reposed]:

@@ -81,11 +81,17 @@ def count_frames(frames: FrameCounts) -> str:
 
 def describe_origin(record: RunRecord) -> str:
     """Where x = y = z = 0 is, and which way the axes point."""
-    if record.tracking and "joined" in record.tracking:
-        return f"that of {record.tracking['joined']['into']}, to which the recording was added"
-    if record.tracking and record.tracking.get("mode") == "rgbd":
-        return "the first camera: x to its right, y down, z forwards"
-    return "where the poses of the recording have it"
+    tracking = record.tracking or {}
+    if "joined" in tracking:
+        return f"that of {tracking['joined']['into']}, to which the recording was added"
+    recording = f"the {'first ' if 'merged' in tracking else ''}recording"
+    if tracking.get("mode") == "rgbd" and "reposed" not in tracking:
+        return (  # rgbd.T_WORLD_FIRST
+            f"the first camera of {recording} that was tracked: x to its right, y forwards, z up if "
+            "it was held level"
+        )
+    poses = tracking.get("reposed") or tracking.get("trajectory") or recording
+    return f"where the poses of {poses} have it"
 
 
 def describe_up(record: RunRecord) -> str:

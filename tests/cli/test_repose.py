@@ -11,6 +11,8 @@ from taichi_unifusion.cli.main import main
 from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.files.trajectories import read_trajectory, write_trajectory
 from taichi_unifusion.geometry.se3 import exp
+from taichi_unifusion.results.record import read_record
+from taichi_unifusion.results.summary import describe_origin
 from taichi_unifusion.types import Trajectory
 
 RECORDING = ["--option", "frames=120", "--option", "width=240", "--option", "height=180"]
@@ -49,6 +51,15 @@ def test_frames_are_tracked_and_mapped_in_one_pass(results):
     assert not list(results.glob(".*"))
 
 
+def test_the_origin_is_said_as_it_is(results):
+    first = read_trajectory(results / "trajectory.txt").T_world_camera[0]
+    right, down, forwards = first[:3, :3].T
+    np.testing.assert_allclose([right, forwards, -down], np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(first[:3, 3], 0, atol=1e-6)
+    said = "x to its right, y forwards, z up if it was held level"
+    assert describe_origin(read_record(results / "metrics.json")).endswith(said)
+
+
 def test_a_map_moves_with_a_trajectory_without_its_images(results, tmp_path, capsys):
     T = exp(np.array([0.5, -0.2, 0.1, 0.0, 0.3, 0.1]))
     before = read_trajectory(results / "trajectory.txt")
@@ -68,6 +79,10 @@ def test_a_map_moves_with_a_trajectory_without_its_images(results, tmp_path, cap
     wanted, found = old_mesh.transformed(T).vertices, read_mesh(out / "mesh.ply").vertices
     np.testing.assert_allclose(found.mean(axis=0), wanted.mean(axis=0), atol=SHIFTED)
     np.testing.assert_allclose(found.std(axis=0), wanted.std(axis=0), atol=SHIFTED)
+    was, record = (read_record(folder / "metrics.json") for folder in (results, out))
+    assert describe_origin(record) == f"where the poses of {tmp_path / 'new.txt'} have it"
+    height = (np.array(record.T_up_world) @ T)[2]  # above the floor, of the old world
+    np.testing.assert_allclose(height, was.T_up_world[2], atol=1e-6)
     assert main(["repose", str(out), "--trajectory", str(results / "trajectory.txt")]) == 0
     back = read_mesh(out / "mesh.ply").vertices
     np.testing.assert_allclose(back.mean(axis=0), old_mesh.vertices.mean(axis=0), atol=VOTES)
