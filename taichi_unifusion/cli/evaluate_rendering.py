@@ -24,10 +24,12 @@ if TYPE_CHECKING:
 
     from ..evaluation.rendering import RenderingResult
     from ..results.reader import Run
+    from ..results.record import ColorRecord
     from ..types import Frame
 
 logger = logging.getLogger(__name__)
 
+FEW_HITS = 0.05  # share of readings that meet the mesh, below which its world is asked about
 RUN_DEFAULT, CHOICE_DEFAULT = "(default: the run's recording)", "(default: the run's)"
 
 
@@ -39,8 +41,8 @@ class EvaluateRendering:
     Example: unifusion evaluate rendering results/kitchen
 
     Of a results folder, with frames that its run did not use: those half-way between the ones that
-    it did. --start, --end and --every choose others between its first and its last, or beyond.
-    Colour is decoded from its colour map at the points hit.
+    it did. --start and --end choose others of these, between its first and its last, or beyond;
+    --every N takes every N-th that it did not use. Colour is decoded from its colour map at the points hit.
     """
 
     reconstruction: Annotated[Positional[Path], arg(metavar="RESULTS|MESH")]
@@ -63,7 +65,7 @@ class EvaluateRendering:
     ] = None
     """Compare with every N-th frame."""
     all: FlagCreatePairsOff[bool] = False
-    """Let frames in that the run has used; alone: these."""
+    """Compare with the frames that the run has used; with --every N let these in."""
     depth_min: Annotated[
         float | None, arg(metavar="M", help_behavior_hint="(default: the run's, else 0.1)")
     ] = None
@@ -104,8 +106,9 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     run = find_run(options.reconstruction)
     mesh, texture = (run.mesh(), None) if run else read_textured_mesh(options.reconstruction)
     recording, run = _recording(options, run)
+    color_record = run.source.color if run else None
     if options.color_camera is not None:
-        recording, _ = found_color(*given_color(recording, options.color_camera))
+        recording, color_record = found_color(*given_color(recording, options.color_camera))
     for sentence in recording.warnings:
         logger.warning("%s", sentence)
     chosen = choose_frames(options, run, recording)
@@ -124,6 +127,7 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
             depth_min=limits.depth_min if options.depth_min is None else options.depth_min,
             depth_max=limits.depth_max if options.depth_max is None else options.depth_max,
         )
+    _check_hits(result)
     used = set(run.used if run else ()) & {score.index for score in result.frames}
     about = {
         "metric": "rendering",
@@ -131,16 +135,43 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
         "recording": recording.name,
         "used_by_the_run": sorted(used),
         "colour": "map" if color else "texture" if texture else "vertices",
+        "images": _images(options, recording, color_record),
     }
-    compared = f"{len(used) or 'none'} of which the run has used" if run else "from file"
+    compared = f", {len(used) or 'none'} of which the run has used" if run else ""
+    count = len(result.frames)
+    colors = (
+        f"colour from the {about['colour']}, compared with images {about['images']}"
+        if result.psnr_db is not None
+        else "no colour was compared"
+    )
     return show(
         options.scores,
         about,
         result,
         _table(result),
-        f"Means over {len(result.frames)} frames of {recording.name} ({_which(chosen)}), {compared}; "
-        f"colour from the {about['colour']}.",
+        f"{'Means over' if count > 1 else 'Of'} {count} frame{'s' * (count > 1)} of {recording.name} "
+        f"({_which(chosen)}){compared}; {colors}.",
     )
+
+
+def _check_hits(result: RenderingResult) -> None:
+    """Raise InputError where no ray meets the mesh, and warn where hardly one does."""
+    where = "is it in the world of the frames' poses, in metres?"
+    if not result.coverage:
+        raise InputError(
+            f"rendering: no ray of {len(result.frames)} frames meets the mesh; {where}"
+        )
+    if result.coverage < FEW_HITS:
+        logger.warning("only %s %% of readings meet the mesh: %s", percent(result.coverage), where)
+
+
+def _images(options: EvaluateRendering, recording: Dataset, color: ColorRecord | None) -> str:
+    """How the images that colour is compared with came about."""
+    if color is None or color.camera is None:
+        return "as the recording registers them" if recording.registered else "as recorded"
+    if options.color_camera is not None:
+        return f"registered with --color-camera {color.choice}"
+    return f"registered with the run's colour camera (--color-camera {color.choice})"
 
 
 def _which(chosen: Sequence[int]) -> str:
@@ -193,13 +224,26 @@ def _recording(options: EvaluateRendering, run: Run | None) -> tuple[Dataset, Ru
 def choose_frames(options: EvaluateRendering, run: Run | None, recording: Dataset) -> Sequence[int]:
     """The frames of the recording to compare with: held-out ones, unless `options.all`."""
     start, end, every = options.start, options.end, options.every
-    if run is not None and (start, end, every) == (None, None, None):
-        every = run.source.every
-        start = run.source.start + (0 if options.all else every // 2)
     start = (run.source.start if run else 0) if start is None else start
     end = run.source.asked.stop if end is None and run and start < run.source.asked.stop else end
     asked = frames_asked(recording, start, end, 1 if every is None else every)
-    held_out = asked if run is None or options.all else [i for i in asked if i not in set(run.used)]
+    if run is None:
+        return asked
+    if every is None:  # of those that are mapped, or half-way between
+        step = run.source.every
+        first = run.source.start + (0 if options.all else step // 2)
+        kept = [i for i in asked if (i - first) % step == 0]
+        if not kept:
+            which = "that the run used" if options.all else "half-way between those the run used"
+            others = "held-out ones with --every 1" + ", or used ones with --all" * (
+                not options.all
+            )
+            raise InputError(
+                f"rendering: no frame {which} is among {asked[0]} to {asked[-1]} of {recording.name}; "
+                f"choose {others}"
+            )
+        asked = kept
+    held_out = asked if options.all else [i for i in asked if i not in set(run.used)]
     if not held_out:
         raise InputError(
             "rendering: the run has used every one of these frames; reconstruct with --every 2 or more to hold "

@@ -183,6 +183,14 @@ def match_poses(
     """Poses (N, 4, 4) of both, both in time order, whose stamps belong together; raises InputError
     for fewer than three.
     """
+    pairs = match(estimate, ground_truth, max_difference)
+    return estimate.T_world_camera[pairs[:, 0]], ground_truth.T_world_camera[pairs[:, 1]]
+
+
+def match(
+    estimate: Trajectory, ground_truth: Trajectory, max_difference: float = MAX_DIFFERENCE
+) -> NDArray[np.int64]:
+    """Which poses (N, 2) of both belong together, as in `match_poses`."""
     pairs = associate(estimate.timestamps, ground_truth.timestamps, max_difference)
     if len(pairs) < FEWEST:
         both = (estimate, ground_truth)
@@ -196,7 +204,7 @@ def match_poses(
             f"trajectory: {len(pairs)} of {len(estimate)} estimated poses lie within {max_difference:g} {unit} of a "
             f"true one, {FEWEST} are needed; the estimate covers {spans[0]} and the ground truth {spans[1]}"
         )
-    return estimate.T_world_camera[pairs[:, 0]], ground_truth.T_world_camera[pairs[:, 1]]
+    return pairs
 
 
 def _pairs(

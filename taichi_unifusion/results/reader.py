@@ -5,6 +5,7 @@ mesh, poses and settings.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..config import Config, load_config
 from ..datasets import Dataset, open_dataset
-from ..errors import DatasetError, FileError, FrameError
+from ..errors import DatasetError, FileError
 from ..evaluation.trajectory import align_poses, match_poses
 from ..evaluation.viewpoints import Viewpoints
 from ..files.mesh_reading import read_mesh
@@ -79,41 +80,64 @@ class Run:
         """The poses that the run used, one a frame of `used`."""
         return read_trajectory(self.folder.trajectory)
 
-    def true_trajectory(self) -> Trajectory:
-        """The recording's own poses of the frames used; a frame without one is left out. Raises
-        DatasetError if all are.
+    def tracked_trajectory(self) -> tuple[Trajectory, tuple[int, ...]]:
+        """The poses that a tracker found, those of frames that were not mapped too, and the places of
+        these in the recording; raises FileError where there are none.
         """
-        recording, stamps, poses, numbers = self.recording, [], [], []
-        for index in self.used:
-            try:
-                frame = recording[index]
-            except (FrameError, IndexError):
-                continue
-            if frame.T_world_camera is not None:
-                stamps.append(frame.timestamp)
-                numbers.append(index)
-                poses.append(frame.T_world_camera)
+        table, file = self.folder.tracking, self.folder.tracked_poses
+        if not (table.exists() and file.exists()):
+            raise FileError(
+                f"{self.folder.path}: holds no {file.name} and {table.name}: its poses were not tracked"
+            )
+        poses, frames = read_trajectory(file), tuple(read_tracked_poses(table, file))
+        if len(frames) != len(poses):
+            raise FileError(f"{file}: is not of the frames of {table.name}; track them again")
+        return poses, frames
+
+    def true_trajectory(
+        self, estimate: Trajectory | None = None, frames: Sequence[int] | None = None
+    ) -> Trajectory:
+        """The recording's own poses of the frames of an estimate, by default of those used, with its
+        time stamps; a frame without one is left out. Raises DatasetError if all are.
+        """
+        estimate, frames = estimate or self.trajectory(), frames or self.used
+        if len(estimate) != len(frames):
+            raise FileError(
+                f"{self.folder.path}: {len(estimate)} poses for {len(frames)} frames; make it again"
+            )
+        recording = self.recording
+        places = [i for i in range(len(frames)) if frames[i] < len(recording)]
+        known = {} if recording.no_poses else {i: recording.pose_at(frames[i])[1] for i in places}
+        poses = {i: pose for i, pose in known.items() if pose is not None}
         if not poses:
             raise DatasetError(
-                f"{recording.name}: has no poses of the {len(self.used)} frames that {self.folder.path} was made "
-                "from"
+                f"{recording.name}: has no poses of the {len(frames)} frames of {self.folder.path}"
             )
-        return Trajectory.of(stamps, numbers, poses)
+        return Trajectory(estimate.timestamps[list(poses)], np.array(list(poses.values())))
 
     def T_recording_run(self) -> NDArray[np.float64]:
         """Takes the run's world to the recording's: the identity, unless poses were tracked; then
-        these are fitted to the recording's own.
+        these are fitted to the recording's own, which is said once.
         """
+        return self._T_recording_run
+
+    @cached_property
+    def _T_recording_run(self) -> NDArray[np.float64]:
         if not self.tracked:
             return np.eye(4)
         if self.recording.no_poses:
-            logger.info("frames are compared where the run found them: errors of poses do not show")
+            logger.info(
+                "%s: frames are compared where the run found them: errors of poses do not show",
+                self.folder.path,
+            )
             return np.eye(4)
         tracked, true = match_poses(self.trajectory(), self.true_trajectory())
         T = align_poses(tracked, true)
         off = np.linalg.norm((T @ tracked)[:, :3, 3] - true[:, :3, 3], axis=1)
         logger.info(
-            "the poses of this run were tracked: its world is fitted to the recording's, %.1f cm off in the mean",
+            "%s: its poses were tracked, so its world is fitted to the recording's by the means of the cameras' "
+            "rotations and positions, %.1f cm off in the mean (ATE is of another fit, of positions alone)",
+            self.folder.path,
             100 * off.mean(),
         )
         return T

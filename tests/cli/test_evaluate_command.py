@@ -15,6 +15,7 @@ from tiny_recording import FLAGS, make_frames, write_folder
 
 from taichi_unifusion import Trajectory, load_map, open_dataset
 from taichi_unifusion.cli import main as cli
+from taichi_unifusion.datasets.color_camera import kinect_color_camera
 from taichi_unifusion.errors import FileError
 from taichi_unifusion.evaluation import Viewpoints, evaluate_rendering, evaluate_surface
 from taichi_unifusion.files.mesh_reading import read_any_mesh, read_mesh
@@ -266,12 +267,14 @@ def test_rendering_takes_held_out_frames_half_way_between_the_used_ones(
 @pytest.mark.parametrize(
     ("flags", "frames", "used"),
     [
-        (["--start", "2"], [2, 4, 5], []),
-        (["--end", "4"], [1, 2], []),
+        (["--start", "2"], [4], []),
+        (["--end", "4"], [1], []),
+        (["--start", "2", "--every", "1"], [2, 4, 5], []),
         (["--every", "2", "--all"], [0, 2, 4, 6], [0, 6]),
         (["--every", "2"], [2, 4], []),
         (["--all"], [0, 3, 6], [0, 3, 6]),
-        (["--start", "3", "--end", "5", "--all"], [3, 4], [3]),
+        (["--start", "1", "--end", "5", "--all"], [3], [3]),
+        (["--start", "3", "--end", "5", "--every", "1", "--all"], [3, 4], [3]),
         (["--all", "--end", "1"], [0], [0]),
     ],
 )
@@ -289,8 +292,9 @@ def test_rendering_stays_between_the_runs_first_and_last_frame(
     for flags, frames in (
         ([], [1, 4, 7]),
         (["--every", "2"], [2, 4, 8]),
-        (["--start", "7", "--end", "11"], [7, 8, 9, 10]),
-        (["--start", "11"], [11, 12]),
+        (["--start", "7", "--end", "11"], [7, 10]),
+        (["--start", "9"], [10]),
+        (["--start", "11", "--every", "1"], [11, 12]),
     ):
         found = evaluate("rendering", results, "folder", longer, *flags)
         assert [frame["index"] for frame in found["frames"]] == frames
@@ -299,9 +303,12 @@ def test_rendering_stays_between_the_runs_first_and_last_frame(
 def test_rendering_of_a_mesh_file(results, recording, evaluate):
     found = evaluate("rendering", results / "mesh.ply", "folder", recording, "--end", "2")
     assert [frame["index"] for frame in found["frames"]] == [0, 1] and found["colour"] == "vertices"
-    own = evaluate("rendering", results, "--vertex-colors", "--all", "--end", "2")
+    own = evaluate("rendering", results, "--vertex-colors", "--all", "--every", "1", "--end", "2")
     assert own["psnr_db"] == pytest.approx(found["psnr_db"]) and own["colour"] == "vertices"
-    assert evaluate("rendering", results, "--all", "--end", "2")["psnr_db"] != found["psnr_db"]
+    assert (
+        evaluate("rendering", results, "--all", "--every", "1", "--end", "2")["psnr_db"]
+        != found["psnr_db"]
+    )
 
 
 def test_rendering_of_a_recording_that_was_moved(results, recording, evaluate, told, tmp_path):
@@ -324,10 +331,7 @@ def test_rendering_leaves_out_frames_that_cannot_be_used(results, recording, cap
         str(results),
         "folder",
         str(spoiled),
-        "--start",
-        "0",
-        "--end",
-        "5",
+        *("--start", "0", "--end", "5", "--every", "1"),
         "--json",
     ]
     assert cli.main(arguments) == 0
@@ -342,8 +346,46 @@ def test_rendering_table(results, capsys):
     out = capsys.readouterr().out
     assert (
         out.splitlines()[0].split("  ")[0] == "depth L1 cm"
-        and "none of which the run has used; colour from the map" in out
+        and "none of which the run has used; colour from the map, compared with images as recorded."
+        in out
     )
+
+
+def test_rendering_of_one_frame_of_a_mesh_file_reads_well(results, recording, capsys):
+    arguments = [str(results / "mesh.ply"), "folder", str(recording), "--end", "1"]
+    assert cli.main(["evaluate", "rendering", *arguments]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "Of 1 frame of folder" in out and "from file" not in out
+    assert "choose others); colour from the vertices, compared with images as recorded." in out
+
+
+def test_rendering_says_which_colour_camera_images_were_registered_with(
+    results, recording, evaluate, tmp_path
+):
+    registered = "registered with the run's colour camera (--color-camera kinect)"
+    color = {"choice": "kinect", "camera": kinect_color_camera().to_values(), "verdict": ""}
+    folder = with_metrics(results, tmp_path / "copy", color=color)
+    assert evaluate("rendering", folder)["images"] == registered
+    assert evaluate("rendering", folder, "--color-camera", "none")["images"] == "as recorded"
+    asked = evaluate("rendering", results, "--color-camera", "kinect")["images"]
+    assert asked == "registered with --color-camera kinect"
+    assert evaluate("rendering", results, "synthetic")["images"] == (
+        "as the recording registers them"
+    )
+
+
+def test_a_mesh_in_another_world_is_told(results, recording, told, tmp_path, caplog):
+    away = np.eye(4)
+    away[2, 3] = 100
+    read_mesh(results / "mesh.ply").transformed(away).save(tmp_path / "away.ply")
+    said = told("rendering", tmp_path / "away.ply", "folder", recording, "--end", "2")
+    assert "no ray of 2 frames meets the mesh; is it in the world of the frames' poses" in said
+    frame = make_frames(1)[0]
+    piece = rectangle((-0.1, -0.1), (0.1, 0.1), 1.0)  # before the first camera
+    piece.transformed(frame.T_world_camera).save(tmp_path / "piece.ply")
+    arguments = [str(tmp_path / "piece.ply"), "folder", str(recording), "--end", "2"]
+    assert cli.main(["evaluate", "rendering", *arguments]) == 0
+    assert "% of readings meet the mesh: is it in the world" in caplog.text
 
 
 # --- Runs whose poses were tracked ----------------------------------------------------------------------------------
@@ -366,7 +408,11 @@ def test_a_tracked_run_is_fitted_to_the_recording(results, truth, evaluate, tmp_
     there, here = (evaluate("rendering", of, "--vertex-colors") for of in (folder, results))
     assert there["depth_median_cm"] == pytest.approx(here["depth_median_cm"], abs=1e-2)
     assert there["psnr_db"] == pytest.approx(here["psnr_db"], abs=0.05)
-    assert "its world is fitted to the recording's, 0.0 cm off" in caplog.text
+    fitted = "its world is fitted to the recording's by the means of the cameras' rotations and positions"
+    assert f"{fitted}, 0.0 cm off in the mean (ATE is of another fit" in caplog.text
+    caplog.clear()
+    evaluate("surface", folder, truth, "--samples", SAMPLES)
+    assert caplog.text.count("its world is fitted") == 1
     assert evaluate("trajectory", folder)["ate_cm"]["max"] < 1e-4
 
 
@@ -392,6 +438,46 @@ def test_trajectory_of_a_results_folder_and_of_files(results, evaluate, tmp_path
         )
         assert (found["matches"], found["rpe_delta"], found["rpe_unit"]) == (3, 2, "frames")
     assert evaluate("trajectory", tmp_path / "truth.txt", results)["matches"] == 3
+
+
+def test_all_tracked_poses_are_judged_if_asked_for(results, recording, evaluate, told, tmp_path):
+    """As if a tracker had found the pose of every frame but one, a little off."""
+    folder = with_metrics(results, tmp_path / "copy")
+    frames, file = (0, 1, 3, 4, 5, 6), folder / "tracking.txt"
+    truth = Trajectory(
+        np.array(frames, float),
+        np.array([open_dataset("folder", recording).pose_at(i)[1] for i in frames]),
+    )
+    write_trajectory(file, truth)
+    (folder / "tracking.csv").write_text(
+        "frame,timestamp,verdict\n" + "".join(f"{i},,tracked\n" for i in range(FRAMES))
+    )
+    found = evaluate("trajectory", folder)
+    assert found["matches"] == 3 and found["rpe_frames_of_the_recording"] == [3, 3]
+    found = evaluate("trajectory", folder, "--tracked")
+    assert found["matches"] == 6 and found["rpe_frames_of_the_recording"] == [1, 2]
+    assert found["ate_unaligned_cm"]["max"] < 1e-5
+    found = evaluate("trajectory", folder, file, "--tracked", "--rpe-delta", "2")
+    assert found["matches"] == 6 and found["rpe_frames_of_the_recording"] == [2, 3]
+    assert "its poses were not tracked" in told("trajectory", results, "--tracked")
+    assert "--tracked is for a results folder" in told("trajectory", file, file, "--tracked")
+    assert "is a folder without trajectory.txt; the truth is a file of poses or a results" in told(
+        "trajectory", file, recording
+    )
+
+
+def test_rpe_is_said_to_be_over_frames_of_the_recording(results, capsys, tmp_path):
+    folder = with_metrics(results, tmp_path / "copy")
+    shutil.copy(folder / "trajectory.txt", folder / "tracking.txt")
+    with open(folder / "tracking.txt", "a") as file:
+        file.write("7 0 0 0 0 0 0 1\n")
+    assert cli.main(["evaluate", "trajectory", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert "RPE, translation over 3 frames [cm]" in out
+    assert "poses of the 3 frames that were mapped; --tracked judges all 4" in out
+    poses = str(folder / "trajectory.txt")
+    assert cli.main(["evaluate", "trajectory", poses, poses, "--rpe-delta", "2"]) == 0
+    assert "RPE, translation over 2 poses [cm]" in capsys.readouterr().out
 
 
 def test_trajectory_table(results, capsys):
@@ -574,6 +660,18 @@ def test_a_folder_that_is_not_there_is_told(metric, told, tmp_path):
     [
         (["surface", "RESULTS"], "a recording of format 'folder' holds no true surface; give one"),
         (["rendering", "RESULTS", "--every", "3"], "the run has used every one of these frames"),
+        (
+            ["rendering", "RESULTS", "--start", "2", "--end", "4"],
+            "no frame half-way between those the run used is among 2 to 3 of",
+        ),
+        (
+            ["rendering", "RESULTS", "--end", "1"],
+            "held-out ones with --every 1, or used ones with --all",
+        ),
+        (
+            ["rendering", "RESULTS", "--start", "4", "--end", "6", "--all"],
+            "no frame that the run used",
+        ),
         (["rendering", "RESULTS", "--depth-max", "0.01"], "depth_min < depth_max"),
         (
             ["rendering", "RESULTS", "--depth-min", "50", "--depth-max", "60"],
