@@ -19,14 +19,15 @@ from ..errors import FrameError, SizeMismatch
 from .atomic import atomic_write
 from .image_headers import MAX_PIXELS, ImageHeader, check_whole, read_header
 
+OPAQUE = 255  # alpha
 INVALID_DEPTH = (0, 65535)  # no reading; 65535 is also what 16 bits saturate at
 SAME_ASPECT = 0.01  # relative difference of width/height up to which colour is resized to depth
 HEADER_BYTES = 4096  # the size in a PNG or PGM header stands within these
 
 
 def read_color(path: Path, *, drop_alpha: bool = False) -> NDArray[np.uint8]:
-    """The 8-bit colour image at `path` as (H, W, 3) RGB, grey as R = G = B; an alpha channel is an
-    error unless `drop_alpha`.
+    """The 8-bit colour image at `path` as (H, W, 3) RGB, grey as R = G = B; an alpha channel that is not
+    opaque everywhere is an error unless `drop_alpha`.
     """
     return decode_color(_read_bytes(path), str(path), drop_alpha=drop_alpha)
 
@@ -37,11 +38,13 @@ def decode_color(data: bytes, where: str, *, drop_alpha: bool = False) -> NDArra
     channels = 1 if image.ndim == 2 else image.shape[2]
     if channels == 1:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), np.uint8)
-    if channels == 4 and drop_alpha:
+    if channels == 4 and (drop_alpha or (image[..., 3] == OPAQUE).all()):
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGB), np.uint8)
     if channels != 3:
         advice = (
-            "pass drop_alpha=True to ignore the fourth" if channels == 4 else "convert it to RGB"
+            "the fourth is not opaque everywhere; pass drop_alpha=True to ignore it"
+            if channels == 4
+            else "convert it to RGB"
         )
         raise FrameError(f"{where}: colour must have 3 channels, got {channels}; {advice}")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

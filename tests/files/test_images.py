@@ -108,6 +108,13 @@ def test_F6_alpha_is_dropped_by_option(scene):
     np.testing.assert_array_equal(open_dataset("7scenes", scene, drop_alpha=True)[1].color, rgb)
 
 
+def test_F6_alpha_that_is_opaque_says_nothing(scene):
+    rgb = make_samples(2)[1].color
+    bgra = np.dstack([rgb[..., ::-1], np.full((12, 16), 255, np.uint8)])
+    (scene / "frame-000001.color.png").write_bytes(encoded(".png", bgra))
+    np.testing.assert_array_equal(open_dataset("7scenes", scene)[1].color, rgb)
+
+
 def test_F6_coloured_depth_is_refused(scene):
     write_image(scene / "frame-000001.depth.png", np.zeros((12, 16, 3), np.uint16))
     with pytest.raises(
