@@ -107,7 +107,8 @@ def query(options: Query) -> int:
         print(text)
     else:  # errors say what is unknown
         said = [entry for entry in listed if entry["text"] not in unknown]
-        print("\n\n".join([*map(_table, said), _origin(folder)]))
+        ranked = [_ranking(options.threshold)] * any(entry["found"] for entry in said)
+        print("\n\n".join([*map(_table, said), "\n".join([*ranked, _origin(folder)])]))
     writer.attempt(
         f"{folder.record}: could not be updated", lambda: add_answers(folder, writer.written)
     )
@@ -215,6 +216,7 @@ def describe(answer: Answer, top: int) -> dict[str, Any]:
         "highest_relevance": round(float(answer.relevance.max(initial=0)), 4),
         "regions": [
             {
+                "strength_m2": round(region.strength, 4),
                 "score": round(region.score, 4),
                 "area_m2": round(region.area, 4),
                 "centroid": [round(x, 3) for x in region.centroid.tolist()],
@@ -224,6 +226,11 @@ def describe(answer: Answer, top: int) -> dict[str, Any]:
         ],
         "regions_in_all": len(answer.regions),
     }
+
+
+def _ranking(threshold: float) -> str:
+    """What regions are ranked by."""
+    return f"ranked by strength: (score - {threshold:g}) times the part of the area that is certain"
 
 
 def _origin(folder: RunFolder) -> str:
@@ -241,12 +248,13 @@ def _origin(folder: RunFolder) -> str:
 def _table(entry: dict[str, Any]) -> str:
     if not entry["found"]:
         return f"{entry['text']}: not here; {entry['reason']}"
-    rows = [["rank", "score", "area m2", "centre x y z m", "size m"]]
+    rows = [["rank", "strength m2", "score", "area m2", "centre x y z m", "size m"]]
     for i, region in enumerate(entry["regions"], start=1):
         low, high = region["box"]
         rows.append(
             [
                 str(i),
+                f"{region['strength_m2']:.3f}",
                 f"{region['score']:.2f}",
                 f"{region['area_m2']:.2f}",
                 " ".join(f"{x:.2f}" for x in region["centroid"]),

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -115,8 +116,10 @@ def read_labels_file(path: Path) -> dict[int, str]:
         names = list(enumerate(lines))
     if not names:
         raise FileError(f"{path}: holds no names; expected one a line")
-    if len(dict(names)) < len(names) or len({name for _, name in names}) < len(names):
-        raise InputError(f"{path}: holds a name or a number twice")
+    for what, values in zip(("number", "name"), zip(*names, strict=True), strict=True):
+        value, times = Counter(values).most_common(1)[0]
+        if times > 1:
+            raise InputError(f"{path}: holds the {what} '{value}' {times} times; each once")
     return dict(names)
 
 

@@ -16,14 +16,15 @@ from ..geometry.triangles import vertex_areas
 from ..rendering.drawing import Viewpoint
 from ..rendering.preview import draw_views
 from ..types import Mesh
-from .pictures import HEAT
+from .pictures import FONT, HEAT, drawable
 from .questions import Answer
 from .regions import Region
 
 LONGEST_NAME = 60  # letters of a text in a file's name
 NUMBERED = 9  # regions whose boxes are drawn
-FONT, INK = cv2.FONT_HERSHEY_SIMPLEX, (40, 40, 40)
+INK = (40, 40, 40)
 HEADER = 64  # [pixels] above the picture
+FAR_AWAY = 10**6  # [pixels] beyond all pictures
 CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
 
@@ -84,38 +85,75 @@ def _draw_box(
     view: Viewpoint,
     taken: list[tuple[int, int, int, int]],
 ) -> None:
-    """The edges of a box that lie before the camera, and a number that covers no other."""
-    corners = region.box[CORNERS, np.arange(3)]  # (8, 3)
-    T = np.linalg.inv(view.T_world_camera)
-    p = corners @ T[:3, :3].T + T[:3, 3]
-    if (p[:, 2] < max(view.near, 0.05)).any():
-        return
-    camera = view.camera
-    at = np.stack(
-        [camera.fx * p[:, 0] / p[:, 2] + camera.cx, camera.fy * p[:, 1] / p[:, 2] + camera.cy],
-        axis=1,
-    )
-    at = np.clip(at, -(10**4), 10**4).round().astype(int)
+    """The edges of a box as far as they are in the picture, and a number above them that covers no
+    other.
+    """
+    lines = _edges_in_view(region.box, view)
     for color, width in (((255, 255, 255), 3), (INK, 1)):
-        for a, b in EDGES:
-            cv2.line(panel, tuple(at[a]), tuple(at[b]), color, width, cv2.LINE_AA)
-    u, v = at[at[:, 1].argmin()]
-    if not (0 <= u < camera.width and 0 <= v < camera.height):
+        for a, b in lines:
+            cv2.line(panel, a, b, color, width, cv2.LINE_AA)
+    if not lines:
         return
+    u, v = min((end for line in lines for end in line), key=lambda end: end[1])
     (wide, high), _ = cv2.getTextSize(str(number), FONT, 0.6, 2)
-    x, y = int(np.clip(u - wide // 2, 2, camera.width - wide - 8)), int(max(v - 8, high + 8))
-    while any(x < d and x + wide + 8 > c and y - high - 8 < f and y > e for c, e, d, f in taken):
-        y += high + 10
-    taken.append((x, y - high - 8, x + wide + 8, y))
-    cv2.rectangle(panel, (x, y - high - 8), (x + wide + 8, y), INK, -1)
-    cv2.putText(panel, str(number), (x + 4, y - 4), FONT, 0.6, (255, 255, 255), 2, cv2.LINE_AA)
+    wide, high = wide + 8, high + 8
+    x, y = _free_place(u - wide // 2, v - 8 - high, (wide, high), panel.shape, taken)
+    taken.append((x, y, x + wide, y + high))
+    cv2.rectangle(panel, (x, y), (x + wide, y + high), INK, -1)
+    at = (x + 4, y + high - 4)
+    cv2.putText(panel, str(number), at, FONT, 0.6, (255, 255, 255), 2, cv2.LINE_AA)
+
+
+def _edges_in_view(box: NDArray, view: Viewpoint) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """The ends [pixels] of what a picture shows of the edges of a box (2, 3)."""
+    corners, camera = box[CORNERS, np.arange(3)], view.camera  # (8, 3)
+    T, near = np.linalg.inv(view.T_world_camera), max(view.near, 0.05)
+    points, lines = corners @ T[:3, :3].T + T[:3, 3], []
+    for a, b in EDGES:
+        p, q = sorted((points[a], points[b]), key=lambda point: -point[2])
+        if p[2] <= near:
+            continue
+        if q[2] < near:  # as far as it lies before the camera
+            q = p + (q - p) * (p[2] - near) / (p[2] - q[2])
+        ends = np.stack([p, q]) @ camera.matrix.T
+        ends = np.clip(ends[:, :2] / ends[:, 2:], -FAR_AWAY, FAR_AWAY).round().astype(int)
+        seen, *line = cv2.clipLine((0, 0, camera.width, camera.height), *map(tuple, ends.tolist()))
+        if seen:
+            lines.append(tuple(line))
+    return lines
+
+
+def _free_place(
+    x: int, y: int, size: tuple[int, int], shape: tuple[int, ...], taken: Sequence[Sequence[int]]
+) -> tuple[int, int]:
+    """The corner of a box (wide, high) inside a panel that covers none of `taken`, as near to (x, y) as
+    there is room.
+    """
+    wide, high = size
+    right, low = shape[1] - wide - 2, shape[0] - high - 2
+    x, y = min(max(x, 2), right), min(max(y, 2), low)
+    steps = range(-NUMBERED, NUMBERED + 1)
+    places = sorted(((i * (wide + 2), j * (high + 2)) for i in steps for j in steps), key=_distance)
+    for across, down in places:
+        u, v = x + across, y + down
+        inside = 2 <= u <= right and 2 <= v <= low
+        if inside and not any(
+            u < d and u + wide > a and v < e and v + high > b for a, b, d, e in taken
+        ):
+            return u, v
+    return x, y
+
+
+def _distance(step: tuple[int, int]) -> int:
+    return step[0] ** 2 + step[1] ** 2
 
 
 def _header(width: int, text: str, found: int) -> NDArray[np.uint8]:
     """The text, how many regions it has, and which colour is which relevance."""
     strip = np.full((HEADER, width, 3), 255, np.uint8)
-    shown = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().strip()
+    shown = drawable(text)
     regions = f"{found} region{'s' * (found != 1)}" if found else "not here"
+    regions += f", the strongest {NUMBERED} numbered" if found > NUMBERED else ""
     title = f"{shown[:60] or 'a text without letters'}: {regions}"
     cv2.putText(strip, title, (12, 26), FONT, 0.65, INK, 1, cv2.LINE_AA)
     left, right = 12, min(12 + 300, width - 200)

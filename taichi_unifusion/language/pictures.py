@@ -5,6 +5,7 @@ legend.
 from __future__ import annotations
 
 import colorsys
+import unicodedata
 from collections.abc import Sequence
 
 import cv2
@@ -27,7 +28,9 @@ NOTHING = (0.35, 0.35, 0.35)  # RGB of a vertex without a label
 GOLDEN = 0.618033988749895  # step of hue that keeps any number of labels apart
 NEAR = 1.0  # [m] a camera nearer than this shows too little of the surroundings
 LABEL_CONTRAST = 0.35  # how much of the surface's own light and dark a label's colour keeps
-LEGEND_WIDTH = 320  # [pixels]
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+LEGEND_WIDTH, WIDEST_LEGEND = 320, 800  # [pixels]
+MARGIN = 14  # [pixels] beside a legend
 SWATCHES = 18, 38  # [pixels] a row of the legend may be high
 
 
@@ -100,20 +103,44 @@ def segmentation_picture(
     picture = draw_views(mesh, views)
     counts = np.bincount(found.labels[found.labels != UNLABELLED], minlength=len(found.names))
     present = [i for i in np.argsort(-counts, kind="stable") if counts[i]]
-    height = picture.shape[0]
-    step = int(np.clip(height // (len(present) + 1), *SWATCHES))
-    legend = np.full((height, LEGEND_WIDTH, 3), 255, np.uint8)
-    for row, i in enumerate(present[: height // step - 1]):
-        top, size = step // 2 + row * step, step * 2 // 3
-        legend[top : top + size, 14 : 14 + 2 * size] = (255 * colors[i] + 0.5).astype(np.uint8)
-        cv2.putText(
-            legend,
-            found.names[i][:24],
-            (26 + 2 * size, top + size - size // 6),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            size / 32,
-            (40, 40, 40),
-            1,
-            cv2.LINE_AA,
-        )
-    return np.hstack([picture, legend])
+    names = [drawable(found.names[i]) or f"name {i + 1}" for i in present]
+    return np.hstack([picture, _legend(picture.shape[0], names, colors[present])])
+
+
+def _legend(height: int, names: Sequence[str], colors: NDArray) -> NDArray[np.uint8]:
+    """A strip (height, W, 3) RGB of names beside their colours (n, 3), as wide as they need; where there
+    are too many, the last row says how many more.
+    """
+    step = int(np.clip(height // (len(names) + 1), *SWATCHES))
+    room, size = height // step - 1, step * 2 // 3
+    if len(names) > room:
+        names = [*names[: room - 1], f"and {len(names) - room + 1} more"]
+        colors = np.vstack([colors[: room - 1], np.ones((1, 3))])
+    scale, left = size / 32, 26 + 2 * size
+    names = [_shortened(name, scale, WIDEST_LEGEND - left - MARGIN) for name in names]
+    widest = max((_width(name, scale) for name in names), default=0)
+    legend = np.full((height, max(LEGEND_WIDTH, left + widest + MARGIN), 3), 255, np.uint8)
+    for row, (name, color) in enumerate(zip(names, colors, strict=True)):
+        top = step // 2 + row * step
+        legend[top : top + size, MARGIN : MARGIN + 2 * size] = (255 * color + 0.5).astype(np.uint8)
+        at = (left, top + size - size // 6)
+        cv2.putText(legend, name, at, FONT, scale, (40, 40, 40), 1, cv2.LINE_AA)
+    return legend
+
+
+def drawable(text: str) -> str:
+    """A text in the letters that pictures can have; "" where it has none of these."""
+    return unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().strip()
+
+
+def _shortened(text: str, scale: float, room: int) -> str:
+    """A text that is no wider than `room` [pixels]: cut, which three dots say, where it must be."""
+    if _width(text, scale) <= room:
+        return text
+    while text and _width(f"{text}...", scale) > room:
+        text = text[:-1]
+    return f"{text.rstrip()}..."
+
+
+def _width(text: str, scale: float) -> int:
+    return cv2.getTextSize(text, FONT, scale, 1)[0][0]

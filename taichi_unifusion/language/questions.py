@@ -30,7 +30,7 @@ class Answer:
     # (V,) 0..1, 0 where the map has no voxel; 0.5 is a draw with the strongest rival
     relevance: NDArray[np.float32]
     similarity: NDArray[np.float32]  # (V,) cosine
-    regions: tuple[Region, ...]  # best first
+    regions: tuple[Region, ...]  # the strongest first
 
     @property
     def found(self) -> bool:

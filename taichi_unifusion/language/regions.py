@@ -1,4 +1,4 @@
-"""Where on a mesh something is: connected parts of high relevance, as boxes, best first."""
+"""Where on a mesh something is: connected parts of high relevance, as boxes, the strongest first."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ class Region:
     """A connected part of the surface that answers a query."""
 
     score: float  # relevance, mean over the area where that is certain
+    strength: float  # [m^2] relevance above the threshold, summed over that area; regions are ranked by it
     area: float  # [m^2]
     centroid: NDArray[np.float64]  # (3,) world [m], of its area
     box: NDArray[np.float64]  # (2, 3) world [m]: lowest and highest corner
@@ -43,8 +44,8 @@ def find_regions(
     min_area: float = MIN_AREA,
     join: float = JOIN,
 ) -> list[Region]:
-    """Connected parts of a mesh where `relevance` (V,) reaches the threshold, those with the largest
-    integral of relevance above it first.
+    """Connected parts of a mesh where `relevance` (V,) reaches the threshold, the strongest first: those
+    that exceed it by most, over most of their area.
 
     A region begins where the relevance is certain and goes on as far as `extent` (V,), the relevance
     without any margin for noise, reaches the threshold; without it, only what is certain counts. A
@@ -78,7 +79,7 @@ def find_regions(
         for piece in pieces
         if areas[piece].sum() >= max(min_area, 1e-12)
     ]
-    return [region for _, region in sorted(regions, key=lambda each: -each[0])]
+    return sorted(regions, key=lambda region: -region.strength)
 
 
 def join_pieces(
@@ -161,16 +162,16 @@ def _connected(mesh: Mesh, inside: NDArray[np.bool_]) -> list[NDArray[np.int64]]
 
 def _region(
     mesh: Mesh, relevance: NDArray, areas: NDArray, group: NDArray, threshold: float
-) -> tuple[float, Region]:
-    """A region, and the integral of its relevance above the threshold."""
+) -> Region:
     points, share = mesh.vertices[group].astype(np.float64), areas[group] / areas[group].sum()
     sure = group[relevance[group] >= threshold]
     weight = areas[sure] / areas[sure].sum()
-    region = Region(
-        float(weight @ relevance[sure]),
+    score = float(weight @ relevance[sure])
+    return Region(
+        score,
+        (score - threshold) * float(areas[sure].sum()),
         float(areas[group].sum()),
         share @ points,
         np.stack([points.min(axis=0), points.max(axis=0)]),
         group,
     )
-    return (region.score - threshold) * float(areas[sure].sum()), region

@@ -20,7 +20,7 @@ SHOWN = 10  # regions of an answer that are listed
 
 @dataclass(frozen=True)
 class ShownAnswer:
-    """An answer as parts of a scene; what was found comes best first."""
+    """An answer as parts of a scene; of what was found, the strongest comes first."""
 
     text: str
     layer: Layer
@@ -47,7 +47,8 @@ def show_answer(
     boxes = [Box(name, each.box) for name, each in zip(names, shown, strict=True)]
     labels = [Label(name, each.centroid) for name, each in zip(names, shown, strict=True)]
     rows = [f"{rank}. {_describe(each)}" for rank, each in enumerate(shown, start=1)]
-    more = f", the best {SHOWN} are listed" if len(regions) > SHOWN else ""
+    more = ", the strongest first" if len(regions) > 1 else ""
+    more += f", {SHOWN} of them listed" if len(regions) > SHOWN else ""
     sentence = (
         f"{text}: {len(regions)} place{'s' * (len(regions) != 1)}{more}"
         if regions

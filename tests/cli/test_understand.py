@@ -12,6 +12,8 @@ from tiny_recording import CONFIG, FLAGS, make_frames, write_folder
 
 from taichi_unifusion import Pipeline, load_map
 from taichi_unifusion.cli import main as cli
+from taichi_unifusion.cli.segment import read_labels_file
+from taichi_unifusion.errors import InputError
 from taichi_unifusion.files.maps import read_map, write_map
 from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.maps import FeatureMap
@@ -117,6 +119,8 @@ def test_a_query_finds_what_is_there_and_says_what_is_not(made, embeddings, caps
     red = lean(read_mesh(made / "mesh.ply"))
     clearly = (red[:, 0] > 0.35) & (red[:, 0] > 3 * red[:, 1:].max(axis=1))
     assert answer["found"] and answer["regions"] and clearly.sum() > 50
+    strengths = [region["strength_m2"] for region in answer["regions"]]
+    assert strengths == sorted(strengths, reverse=True) and strengths[-1] > 0
     scores = mesh.attributes["relevance"][:, 0]
     assert (scores[clearly] > 0.4).mean() > FOUND and (scores[~clearly] > 0.4).mean() < 0.5
     assert (made / "query-red.png").stat().st_size > 1000 and (made / "query.json").exists()
@@ -132,6 +136,8 @@ def test_what_is_not_found_leaves_no_mesh_and_what_is_unknown_does_not_cost_the_
     made, embeddings, capsys
 ):
     assert ask(made, embeddings, "query", "red", "green", "--threshold", "0.4") == 0
+    out = capsys.readouterr().out
+    assert "strength m2  score" in out and "ranked by strength: (score - 0.4) times" in out
     both = read_mesh(made / "query.ply")
     assert {"relevance_red", "relevance_green"} <= set(both.attributes)
     capsys.readouterr()
@@ -195,6 +201,16 @@ def test_segmentation_names_every_vertex_and_measures_itself(made, embeddings, t
     assert ask(made, embeddings, *arguments) == 0
     out = capsys.readouterr().out
     assert "of the points are right" in out and "segmentation.ply" in out
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [("1 red\n2 blue\n1 green\n", "number '1' 2 times"), ("a\nb\nb\nb\n", "name 'b' 3 times")],
+)
+def test_labels_that_stand_twice_are_named(tmp_path, lines, told):
+    (tmp_path / "labels.txt").write_text(lines)
+    with pytest.raises(InputError, match=told):
+        read_labels_file(tmp_path / "labels.txt")
 
 
 def test_info_says_where_features_come_from_and_which_answers_there_are(
@@ -266,7 +282,7 @@ def test_wrong_questions_end_with_one_sentence(made, embeddings, tmp_path, capfd
                 "--text",
                 f"embeddings:{embeddings}",
             ],
-            "twice",
+            "holds the name 'red' 2 times",
         ),
         (
             [

@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import unicodedata
 
+import cv2
 import numpy as np
 import pytest
 from places import DEVICE
@@ -15,10 +16,17 @@ import taichi_unifusion as uf
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.language.answers import answer_picture, file_name, why_not_here
 from taichi_unifusion.language.embeddings import read_embeddings
-from taichi_unifusion.language.questions import Answer
-from taichi_unifusion.language.regions import find_regions
+from taichi_unifusion.language.pictures import (
+    MARGIN,
+    WIDEST_LEGEND,
+    label_colors,
+    segmentation_picture,
+)
+from taichi_unifusion.language.questions import Answer, Segmentation
+from taichi_unifusion.language.regions import Region, find_regions
+from taichi_unifusion.rendering.drawing import Viewpoint
 from taichi_unifusion.rendering.preview import choose_views
-from taichi_unifusion.types import Mesh
+from taichi_unifusion.types import Mesh, PinholeCamera
 
 LONG = "a very long description of something that stands in a corner of the room behind"
 
@@ -113,6 +121,16 @@ def test_pieces_a_few_centimetres_apart_are_one_region():
     assert len(find_regions(small, np.full(200, 0.9), min_area=0.015, join=0.05)) == 1
 
 
+def test_regions_are_ranked_by_the_strength_that_they_carry():
+    """A large one before a small one that wins more clearly."""
+    mesh = squares(0, 2, 4)
+    mesh.vertices[100:200, :2] *= np.float32([1, 0.1])  # a tenth of the area
+    large, small, weak = find_regions(mesh, np.repeat([0.7, 0.95, 0.51], 100))
+    assert [round(each.score, 2) for each in (large, small, weak)] == [0.7, 0.95, 0.51]
+    strengths = [large.strength, small.strength, weak.strength]
+    assert strengths == pytest.approx([0.2, 0.045, 0.01], abs=1e-4)
+
+
 def test_a_region_goes_on_where_the_query_merely_wins():
     mesh = squares(0, 3)
     column = np.tile(np.arange(10), 20)  # of each square's grid, 0..9 along x
@@ -176,3 +194,66 @@ def test_a_picture_shows_title_scale_and_a_box_a_region():
     assert (header[:34] < 100).any() and (header[38:50] != 255).any()
     assert (plain[-240:] != boxed[-240:]).any(axis=2).sum() > 100
     assert (answer_picture(mesh, "küche 🪑", (), views)[:34] < 100).any()
+
+
+@pytest.fixture
+def written(monkeypatch):
+    """Every text that is drawn, and where it begins."""
+    texts, draw = [], cv2.putText
+
+    def put(picture, text, at, *rest):
+        texts.append((text, at))
+        return draw(picture, text, at, *rest)
+
+    monkeypatch.setattr(cv2, "putText", put)
+    return texts
+
+
+def looking_down(height: float, size=(320, 240)) -> Viewpoint:
+    """From above (0.5, 0.5), with y down in the picture."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[:3, 3] = 0.5, 0.5, height
+    camera = PinholeCamera(*size, 200.0, 200.0, (size[0] - 1) / 2, (size[1] - 1) / 2)
+    return Viewpoint(camera, T, 0.05)
+
+
+def box(low, high, strength=1.0) -> Region:
+    """A region of that box."""
+    corners = np.array([low, high], float)
+    return Region(0.9, strength, 1.0, corners.mean(axis=0), corners, np.arange(3))
+
+
+def test_every_box_that_is_seen_has_its_number_in_the_picture(written):
+    mesh = squares(0).with_attribute("color", np.full((100, 3), 0.5))
+    regions = [
+        box((0.4, 0.4, 0), (0.6, 0.6, 0)),
+        box((0.4, 0.4, 0), (0.6, 9, 0)),  # its far end lies outside
+        box((0.4, 0.4, 0), (0.6, 0.6, 5)),  # and of this one behind the camera
+        *[box((0.4, -0.02, 0), (0.6, 0, 0))] * 5,  # all at the lower edge
+    ]
+    answer_picture(mesh, "sofa", [*regions, box((7, 7, 0), (8, 8, 0))], [looking_down(1.0)])
+    numbers = {text: at for text, at in written if text.isdigit()}
+    assert sorted(numbers) == [str(n) for n in range(1, len(regions) + 1)]  # not what is not seen
+    places = np.array(list(numbers.values()))
+    assert (places >= 0).all() and (places < (320, 240)).all()
+    apart = np.abs(places[:, None] - places).max(axis=2)
+    assert apart[~np.eye(len(places), dtype=bool)].min() > 12  # none covers another
+
+
+LONG_NAMES = ("monitor (computer equipment) computer monitor", "sofa", "椅子", "name " * 60)
+
+
+def test_a_legend_is_as_wide_as_its_names_and_says_what_it_leaves_out(written):
+    mesh = squares(0).with_attribute("color", np.full((100, 3), 0.5))
+    view = looking_down(2.0)
+    found = Segmentation(LONG_NAMES, np.arange(100) % 4, np.ones(100))
+    picture = segmentation_picture(mesh, found, label_colors(4), [view])
+    texts = {text for text, _ in written}
+    assert {LONG_NAMES[0], "sofa", "name 3"} <= texts
+    cut = next(text for text in texts if text.startswith("name name"))
+    assert cut.endswith("...") and picture.shape[1] <= 320 + WIDEST_LEGEND
+    assert (picture[:, -MARGIN:] == 255).all()  # nothing is cut off at the edge
+    written.clear()
+    many = Segmentation(tuple(f"thing {i}" for i in range(50)), np.arange(100) % 50, np.ones(100))
+    segmentation_picture(mesh, many, label_colors(50), [view])
+    assert written[-1][0] == f"and {51 - len(written)} more"
