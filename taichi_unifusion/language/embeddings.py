@@ -19,6 +19,10 @@ from ..files.atomic import read_bytes
 from ..files.json_text import parse_json
 from ..networks.encoders import unit_length
 
+# letters of a word of a name from which it is surely not another word with one more, less or moved,
+LONG = 8
+VERY_LONG = 10  # or with one exchanged
+SHOWN = 3  # names that hold the very word that is asked
 SLIP, SURE_SLIP = 0.75, 0.85  # likeness of words with letters in another order, and of other words
 
 
@@ -58,15 +62,22 @@ class TextEmbeddings:
 
     def _spelled_like(self, word: str) -> str:
         """What may have been meant: names that differ by a slip of the fingers, not other words."""
-        names = {_bare(name) for name in self.names} | {_plain(name) for name in self.synonyms}
+        names = sorted({_bare(name) for name in self.names} | {*map(_plain, self.synonyms)})
         near = [
             name
-            for name in difflib.get_close_matches(word, sorted(names), n=6, cutoff=SLIP)
+            for name in difflib.get_close_matches(word, names, n=6, cutoff=SLIP)
             if sorted(name) == sorted(word)
             or difflib.SequenceMatcher(None, word, name).ratio() >= SURE_SLIP
         ]
+        near = near or [
+            name for name in names if any(_slipped(word, part) for part in name.split())
+        ]
         words = " or ".join(f"'{name}'" for name in near[:2])
-        return f" (did you mean {words}?)" if words else ""
+        if words:
+            return f" (did you mean {words}?)"
+        holding = [name for name in names if word in name.split()][:SHOWN]
+        words = ", ".join(f"'{name}'" for name in holding)
+        return f" (names with that word: {words})" if words else ""
 
     def listing(self) -> list[tuple[str, tuple[str, ...]]]:
         """Every name, and what else finds it: ('sofa', ('couch', 'lounge'))."""
@@ -149,6 +160,22 @@ def _read_names(path: Path) -> tuple[list[str], dict[str, int]]:
         raise FileError(
             f"{path}: not a list of names ({type(error).__name__}: {str(error)[:120]})"
         ) from None
+
+
+def _slipped(word: str, part: str) -> bool:
+    """Whether a word is one of a name with a single slip of the fingers inside: a letter that is missing
+    or too many, two that changed places, in very long words another one. Short words and endings make
+    other words.
+    """
+    short, long = sorted((word, part), key=len)
+    if len(short) < LONG or (short[0], short[-1]) != (long[0], long[-1]):
+        return False
+    if len(long) == len(short) + 1:
+        return any(long[:i] + long[i + 1 :] == short for i in range(len(long)))
+    apart = [i for i, (a, b) in enumerate(zip(short, long, strict=False)) if a != b]
+    if len(short) != len(long) or not apart or apart[-1] - apart[0] > 1:
+        return False
+    return sorted(short) == sorted(long) or (len(apart) == 1 and len(short) >= VERY_LONG)
 
 
 def _plain(name: str) -> str:

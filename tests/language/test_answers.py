@@ -100,6 +100,32 @@ def test_synonyms_and_composed_letters_are_found(names_file, text, row):
 
 @pytest.mark.parametrize(
     ("text", "told"),
+    [
+        ("televison", " (did you mean 'television set'?)"),
+        ("telveision", " (did you mean 'television set'?)"),
+        ("televizion", " (did you mean 'television set'?)"),
+        ("comforler", ""),  # another letter makes another word of a shorter one
+        ("televisiom", ""),  # a slip at the end makes too many other words
+        ("comftorer", ""),  # two slips
+        ("tabel", ""),
+        ("cleaning", ""),
+        ("television", " (names with that word: 'television set')"),
+        ("table", " (names with that word: 'billiard table', 'coffee table', 'kitchen table')"),
+    ],
+)
+def test_a_slip_in_one_word_of_several_is_guessed_where_that_word_is_long(tmp_path, text, told):
+    names = ["television set", "kitchen table", "coffee table", "billiard table", "night table"]
+    names += ["dining comforter", "cleaner's bag"]
+    (tmp_path / "v.txt").write_text("\n".join(names))
+    np.save(tmp_path / "v.npy", np.eye(len(names), dtype=np.float32))
+    with pytest.raises(InputError) as raised:
+        read_embeddings(tmp_path / "v.npy").text_features([text])
+    said = str(raised.value)
+    assert told in said and ("(" in said.split(";")[0]) == bool(told)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
     [("chiar", " (did you mean 'chair'?)"), ("coach", ""), ("couches", ""), ("touch", "")],
 )
 def test_only_slips_of_the_fingers_are_guessed(names_file, text, told):
