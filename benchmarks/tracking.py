@@ -108,11 +108,13 @@ def map_error(
         return None, None
 
     def posed(index: int) -> uf.Frame:
-        return replace(frames[index], T_world_camera=poses[index], color=None)
+        return replace(frames[index], T_world_camera=poses[index])
 
     pipeline = uf.Pipeline()
     pipeline.run([posed(i) for i in kept])
-    result = evaluate_rendering(pipeline.extract_mesh(), (posed(i) for i in left_out))
+    result = evaluate_rendering(
+        pipeline.extract_mesh(), (replace(posed(i), color=None) for i in left_out)
+    )
     return result.depth_l1_cm, result.depth_median_cm
 
 

@@ -4,7 +4,9 @@ pictures of what is worst.
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from places import DEVICE
+from tiny_recording import make_frames, write_folder
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
@@ -22,6 +25,7 @@ import house  # noqa: E402
 import properties_flicker  # noqa: E402
 import quality  # noqa: E402
 import quality_pictures  # noqa: E402
+import rendering  # noqa: E402
 import speed  # noqa: E402
 import speed_profile  # noqa: E402
 import speed_tables  # noqa: E402
@@ -31,6 +35,7 @@ from quality_scenes import split  # noqa: E402
 from speed_sides import ByHand, OpenTsdf, Ours, Times  # noqa: E402
 
 from taichi_unifusion import Config, Frame, PinholeCamera  # noqa: E402
+from taichi_unifusion.cli import main as cli  # noqa: E402
 from taichi_unifusion.datasets.synthetic import SyntheticRoom  # noqa: E402
 from taichi_unifusion.errors import InputError, RuntimeStateError  # noqa: E402
 from taichi_unifusion.kernels.layout import Layout  # noqa: E402
@@ -173,11 +178,12 @@ def test_flicker_is_the_change_at_the_same_points(tmp_path):
     assert cv2.imread(str(tmp_path / "sheet.jpg")).shape == (3 * 216, 5 * 288, 3)
 
 
-def test_the_table_of_trackers_has_a_row_a_method_and_tells_good_poses_from_bad_ones():
+def test_the_table_of_trackers_has_a_row_a_method_and_tells_good_poses_from_bad_ones(caplog):
     frames = SyntheticRoom(frames=240, width=160, height=120)[:11]
     ours, given = tracking.compare(["ours"], frames)
     assert ours[:2] == ["ours", "11 of 11"] and given[:2] == ["given poses", "11 of 11"]
     assert 0 < float(ours[2]) < 1 and len(ours) == len(given) == len(tracking.HEADER)
+    assert "colour image" not in caplog.text  # there are some
     truth = {frame.index: frame.T_world_camera for frame in frames}
     pyramids = {index: tracking.pyramid(frames[index]) for index in (0, 10)}
     still = dict.fromkeys(truth, truth[0])
@@ -331,3 +337,19 @@ def test_paper_maps_are_timed_one_by_one_and_together(monkeypatch, capsys):
     verdict = gpu_checks.table(DEVICE, 3, (160, 120))
     assert all(name in verdict for name in ("surface", "color", "infrared", "latent", "all"))
     assert "| latent |" in capsys.readouterr().out
+
+
+def test_rendering_measures_what_the_commands_make(tmp_path, monkeypatch, capsys):
+    recording = write_folder(tmp_path / "recording", make_frames(3))
+    results = str(tmp_path / "results")
+    said = ["folder", str(recording), "--mesh.formats", "ply", "--out", results, "--device", DEVICE]
+    assert cli.main(["reconstruct", *said]) == 0
+    capsys.readouterr()
+    assert cli.main(["evaluate", "rendering", results, "--all", "--json"]) == 0
+    known = json.loads(capsys.readouterr().out)
+    monkeypatch.setattr(sys, "argv", ["rendering.py", "folder", str(recording)])
+    rendering.main()
+    line = capsys.readouterr().out.splitlines()[0]
+    found = [float(number) for number in re.findall(r"\d+\.\d+", line)]
+    names = ("depth_l1_cm", "depth_median_cm", "coverage", "psnr_db", "ssim")
+    assert found == pytest.approx([known[name] for name in names], abs=2e-3)
