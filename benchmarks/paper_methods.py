@@ -53,8 +53,8 @@ def method_of(name: str) -> Method:
             )
         if path.stem in METHODS:
             raise InputError(
-                f"method '{name}' would be called '{path.stem}', as one that there is; give the "
-                "file another name"
+                f"method '{name}' would be called '{path.stem}', as a method that there is already; "
+                "give the file another name"
             )
         name, path = path.stem, path.resolve()
     settings = dump_config(load_config(path))

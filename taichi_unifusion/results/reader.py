@@ -135,8 +135,8 @@ class Run:
         T = align_poses(tracked, true)
         off = np.linalg.norm((T @ tracked)[:, :3, 3] - true[:, :3, 3], axis=1)
         logger.info(
-            "%s: its poses were tracked, so its world is fitted to the recording's by the means of the cameras' "
-            "rotations and positions, %.1f cm off in the mean (ATE is of another fit, of positions alone)",
+            "%s: its poses are not the recording's, so its world is fitted to the recording's by the means of "
+            "the cameras' rotations and positions, %.1f cm off in the mean (ATE is of another fit, of positions alone)",
             self.folder.path,
             100 * off.mean(),
         )
