@@ -19,6 +19,7 @@ from .color_camera import ColorCamera
 from .color_rig import NEAREST, PARAMETERS, Rig, look_up, project, residuals_of, shrunk
 from .color_sightings import Sightings, find_sightings
 from .dataset import Dataset
+from .loading import index_in_recording
 
 # what is likely of a rig, one standard deviation each; it decides what the frames leave open
 LIKELY = np.array([*[np.radians(3.0)] * 3, *[0.03] * 3, 0.1, 0.02])
@@ -53,16 +54,14 @@ def estimate_color_camera(recording: Dataset) -> ColorEstimate:
     """The colour camera of a recording of posed frames whose colour may not be registered to depth.
 
     `recording` gives colour as it was taken, in the size of depth. The estimate's camera is None
-    where colour fits, where frames tell too little, and where frames left out do not gain clearly.
+    where colour fits, where frames tell too little, and where frames left out do not gain clearly. Groups
+    of neighbours must see the same: give all frames of a range, and thin them out for the map afterwards.
     """
     if recording.registered:
         return ColorEstimate(None, "registered by the recording itself")
     groups = list(find_sightings(recording))
     if len(groups) < LEAST_GROUPS:
-        return ColorEstimate(
-            None,
-            "left as recorded: the camera moves too little, or too few frames have poses and colour, to tell",
-        )
+        return ColorEstimate(None, f"left as recorded: {_too_little(recording)}")
     used, left_out = groups[::2], groups[1::2]
     start = Rig(groups[0].camera, np.eye(3), np.zeros(3))
     found = _solve(used, start)
@@ -79,6 +78,18 @@ def estimate_color_camera(recording: Dataset) -> ColorEstimate:
         )
         return ColorEstimate(None, verdict, gain, len(gains))
     return ColorEstimate(found.camera(), _described(found, gain, len(gains)), gain, len(gains))
+
+
+def _too_little(recording: Dataset) -> str:
+    """Why there are too few groups of frames that see the same."""
+    given = len(recording)
+    step = index_in_recording(recording, 1) - index_in_recording(recording, 0) if given > 1 else 1
+    if step > 1:
+        return (
+            f"{given} frames, {step} apart in their recording, see too little of the same to tell; give the "
+            "frames between them too, and thin them out afterwards"
+        )
+    return "the camera moves too little, or too few frames have poses and colour, to tell"
 
 
 def _described(rig: Rig, gain: float, frames: int) -> str:

@@ -66,6 +66,14 @@ class Shuffled(TwoCameras):
         return super().color_of((17 * index) % len(self))
 
 
+def test_thinned_frames_are_said_to_be_thinned():
+    """All of them tell what every fifth does not."""
+    recording = TwoCameras(rig_beside(CAMERA, focal=0.9), frames=50)
+    thinned = estimate_color_camera(recording[::5])
+    assert thinned.camera is None and "10 frames, 5 apart in their recording" in thinned.verdict
+    assert estimate_color_camera(recording[:50:1]).camera is not None
+
+
 def test_an_answer_that_explains_nothing_is_refused():
     estimate = estimate_color_camera(Shuffled(rig_beside(CAMERA), frames=40))
     assert estimate.camera is None and estimate.verdict.startswith("left as recorded")
