@@ -240,9 +240,9 @@ def _origin(folder: RunFolder) -> str:
     from ..results.summary import describe_origin
 
     try:
-        return f"x y z from {describe_origin(read_record(folder.record))}"
+        return f"origin of x y z: {describe_origin(read_record(folder.record))}"
     except FileError:  # a folder without a record, or a damaged one
-        return "x y z in the world of the map"
+        return "origin of x y z: that of the map"
 
 
 def _table(entry: dict[str, Any]) -> str:

@@ -138,6 +138,7 @@ def test_what_is_not_found_leaves_no_mesh_and_what_is_unknown_does_not_cost_the_
     assert ask(made, embeddings, "query", "red", "green", "--threshold", "0.4") == 0
     out = capsys.readouterr().out
     assert "strength m2  score" in out and "ranked by strength: (score - 0.4) times" in out
+    assert "origin of x y z: where the poses of the recording have it" in out
     both = read_mesh(made / "query.ply")
     assert {"relevance_red", "relevance_green"} <= set(both.attributes)
     capsys.readouterr()
