@@ -91,9 +91,10 @@ def render(options: Render) -> int:
     size = _size(options)
     from .. import runtime
     from ..viewer.render import Picturing, camera_of
+    from ..viewer.several import with_shared_scales
 
     sink = _check_out(options, size)
-    scenes = [_open(path, options) for path in options.dirs]
+    scenes = with_shared_scales([_open(path, options) for path in options.dirs])
     camera = camera_of(_panel(size, len(scenes)), options.fov)
     poses = _poses(options, scenes[0], camera)
     layer = _layer(options)

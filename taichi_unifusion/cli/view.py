@@ -127,7 +127,7 @@ def _show_window(scene: Scene, sources: list[ResultsSource], texts: tuple[str, .
 
 def _scene_of(sources: list[ResultsSource], overlay: bool) -> Scene:
     """One scene of all of them; folders of equal names are told apart by their paths."""
-    from ..viewer.scene import beside, overlaid
+    from ..viewer.several import beside, overlaid
 
     scenes = [source.open() for source in sources]
     if len(scenes) == 1:

@@ -37,21 +37,25 @@ def write_glb(
     T_up_world: NDArray | None = None,
     lit: bool = False,
     image: ImageKind = "jpg",
+    light: NDArray | None = None,
 ) -> None:
     """Write `mesh` to an open file: positions, unit normals, and its texture or else its 8-bit
     colours by vertex, as linear light; in the order of the vertices.
 
     `T_up_world` (4, 4), rigid, takes the world to a frame whose z is up, and gives the node its
-    turn to +Y up; without it the world is taken as it is. Colours of a recording hold its light, so
+    turn to +Y up; without it the world is taken as it is. `light` (V, 3) is written as linear light
+    in place of the mesh's own colours. Colours of a recording hold its light, so
     viewers are told to add none (KHR_materials_unlit) unless `lit`. Raises InputError where
     vertices are not finite: glTF has no number for that.
     """
     if not np.isfinite(mesh.vertices).all():
         raise InputError("mesh: has vertices that are not finite, which GLB cannot hold")
     columns: dict[str, NDArray[Any]] = {"POSITION": np.ascontiguousarray(mesh.vertices, "<f4")}
-    colors = None if texture else colors_of(mesh)
+    colors = None if texture or light is not None else colors_of(mesh)
     if texture is not None:
         columns["TEXCOORD_0"] = np.ascontiguousarray(texture.coordinates, "<f4")
+    elif light is not None:
+        columns["COLOR_0"] = np.ascontiguousarray(light, "<f4")
     elif colors is not None:
         # floats: 8 linear bits would lose the dark steps, and trimesh misreads 16
         columns["COLOR_0"] = LINEAR_OF_BYTE.astype("<f4")[colors]
@@ -65,7 +69,7 @@ def write_glb(
     if texture:
         matt["baseColorTexture"] = {"index": 0}
         said |= _describe_texture(len(blocks), image)
-    if (texture or colors is not None) and not lit:
+    if (texture or "COLOR_0" in columns) and not lit:
         said["materials"][0]["extensions"] = {UNLIT: {}}
         said["extensionsUsed"] = [UNLIT]
     if T_up_world is not None:

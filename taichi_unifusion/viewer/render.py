@@ -59,14 +59,7 @@ class Picturing:
         picture = self._drawable.draw(view, self.samples)
         boxes, labels = self.scene.boxes, self.scene.labels
         picture = add_marks(picture, self.camera, T_world_camera, boxes, labels)
-        legend = next(
-            (
-                shown.layer(self.layer).legend
-                for shown in self.scene.meshes
-                if self.layer in {layer.name for layer in shown.layers}
-            ),
-            None,
-        )
+        legend = self.scene.legend(self.layer)
         return add_legend(picture, legend) if legend is not None and self.legend else picture
 
     def depth(self, T_world_camera: NDArray) -> NDArray[np.float32]:

@@ -22,7 +22,6 @@ UNKNOWN = (120, 120, 125)  # RGB of a vertex that has no value
 OUTLIERS = 0.5  # percent of the vertices at either end that do not count for the size of a scene
 AZIMUTHS, LOOKED_AT = 24, 50_000  # sides that an overview may be from; triangles that choose it
 DISTANCE = 1.8  # of an overview from the middle of a scene, in half its diagonal
-APART = 0.15  # of the width of a result: the gap to the next one beside it
 
 
 @dataclass(frozen=True)
@@ -245,6 +244,11 @@ class Scene:
         """The layers of all meshes, in their order, each name once."""
         return tuple(dict.fromkeys(layer.name for mesh in self.meshes for layer in mesh.layers))
 
+    def legend(self, name: str) -> Legend | None:
+        """What the colours of a layer mean, on whichever mesh has it."""
+        layers = (layer for mesh in self.meshes for layer in mesh.layers)
+        return next((layer.legend for layer in layers if layer.name == name), None)
+
     @property
     def triangles(self) -> int:
         """How many triangles there are in all meshes."""
@@ -296,45 +300,3 @@ class Scene:
 def short_number(value: float) -> str:
     """A number as people read it: three digits, or a whole number where it has more."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-
-
-def beside(scenes: Sequence[Scene]) -> Scene:
-    """Several scenes in one, from left to right; boxes and labels move along with their meshes."""
-    placed, place = [], 0.0
-    right = _right_of(scenes[0])
-    for scene in scenes:
-        corners = np.array(np.meshgrid(*scene.bounds().T)).reshape(3, -1).T @ right
-        low, high = float(corners.min()), float(corners.max())
-        by = (place - low) * right if placed else np.zeros(3)
-        place = (high if not placed else place + high - low) + APART * (high - low)
-        placed.append(_moved(scene, by))
-    return overlaid(placed)
-
-
-def overlaid(scenes: Sequence[Scene]) -> Scene:
-    """Several scenes in one, each where it is; up is that of the first."""
-    return Scene(
-        ", ".join(scene.name for scene in scenes),
-        tuple(mesh for scene in scenes for mesh in scene.meshes),
-        tuple(camera for scene in scenes for camera in scene.cameras),
-        tuple(box for scene in scenes for box in scene.boxes),
-        tuple(label for scene in scenes for label in scene.labels),
-        scenes[0].T_up_world,
-    )
-
-
-def _right_of(scene: Scene) -> NDArray[np.float64]:
-    """(3,) unit, level: to the right of whoever looks by `overview`."""
-    eye, center = scene.overview()
-    right = np.cross(center - eye, scene.up)
-    return right / np.linalg.norm(right)
-
-
-def _moved(scene: Scene, by: NDArray) -> Scene:
-    return replace(
-        scene,
-        meshes=tuple(mesh.moved(by) for mesh in scene.meshes),
-        cameras=tuple(camera.moved(by) for camera in scene.cameras),
-        boxes=tuple(replace(box, corners=box.corners + by) for box in scene.boxes),
-        labels=tuple(replace(label, position=label.position + by) for label in scene.labels),
-    )

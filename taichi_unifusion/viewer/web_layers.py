@@ -57,11 +57,7 @@ class LayerPanel:
     def show_chosen(self) -> None:
         """Show the layer that is chosen, with its legend."""
         self.results.stage.show_layer(self.layer.value)
-        meshes = self.results.scene.meshes
-        shown = [mesh.layer(self.layer.value) for mesh in meshes]
-        self.legend.content = legend_html(
-            next((each.legend for each in shown if each.name == self.layer.value), None)
-        )
+        self.legend.content = legend_html(self.results.scene.legend(self.layer.value))
 
     def refresh(self) -> None:
         """Say what there is now."""

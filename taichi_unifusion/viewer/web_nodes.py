@@ -13,13 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files.glb import write_glb
+from ..files.srgb import LINEAR_OF_BYTE
 from ..types import Mesh
 from .scene import Layer, SceneMesh
+from .tone_mapping import light_that_shows
 
 if TYPE_CHECKING:
     import viser
 
 BANDS = 24  # of height: a cut moves in steps of a 24th of the scene
+RELIEF = 0.12  # share of the light by which a side is lighter or darker, at most
+LIT_FROM = np.array([0.66, 0.36, 0.66])  # unit, in the scene: no two sides of a box look alike
 KEPT_LAYERS = 4  # of a mesh that stay in the browser; each costs some 30 MB per million triangles
 
 
@@ -118,13 +122,16 @@ class LayerNodes:
 def glb_of(mesh: Mesh, layer: Layer, kept: NDArray[np.bool_]) -> bytes:
     """The triangles that are `kept` (F,) in the colours of a layer, as the bytes of a GLB.
 
-    Colours of a recording hold its light and are shown as they are; those of values get light, so
-    that shapes can be seen.
+    They are drawn as they are, without lights, so that the legend says what is seen. Those of values
+    are a little lighter on one side and darker on the other, so that shapes can be told.
     """
-    bare = Mesh(mesh.vertices, mesh.faces, mesh.normals if layer.lit else None)
-    part, rows = bare.part(kept)
+    part, rows = Mesh(mesh.vertices, mesh.faces, mesh.normals).part(kept)
+    light = LINEAR_OF_BYTE[layer.colors[rows]]
+    if layer.lit and part.normals is not None:
+        light = np.clip(light * (1 + RELIEF * part.normals @ LIT_FROM)[:, None], 0, 1)
     file = io.BytesIO()
-    write_glb(file, part.with_attribute("color", layer.colors[rows] / 255), lit=layer.lit)
+    bare = Mesh(part.vertices, part.faces)
+    write_glb(file, bare, light=light_that_shows(light))
     return file.getvalue()
 
 

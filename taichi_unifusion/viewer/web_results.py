@@ -9,6 +9,7 @@ from dataclasses import replace
 from .answers import ShownAnswer
 from .decimation import decimate, decimate_scene
 from .scene import Box, Label, Scene, SceneMesh
+from .several import share_scales
 from .source import ResultsSource
 from .web import WebViewer
 from .web_stage import Stage
@@ -48,7 +49,13 @@ class ShownResults:
     def replace_mesh(self, i: int, whole: SceneMesh) -> None:
         """Show another mesh in the place of one."""
         self.wholes[i] = whole
-        self.stage.replace_mesh(i, decimate(whole, MOST_TRIANGLES // len(self.wholes)))
+        before = list(self.scene.meshes)
+        before[i] = decimate(whole, MOST_TRIANGLES // len(self.wholes))
+        for j, mesh in enumerate(share_scales(before)):
+            if j == i:
+                self.stage.replace_mesh(i, mesh)
+            elif mesh is not before[j]:  # its scale has become wider
+                self.stage.relayer_mesh(j, mesh)
 
     def add_answer(self, i: int, answer: ShownAnswer) -> None:
         """Give a mesh the layer of an answer."""

@@ -240,8 +240,7 @@ class SceneWindow:
     def _stage(self) -> None:
         legend = None
         if self.scene is not None and self.layers:
-            name = self.layers[self.layer]
-            legend = self.scene.meshes[0].layer(name).legend
+            legend = self.scene.legend(self.layers[self.layer])
         shown = legend if self.legend else None
         clicked = self.canvas.stage(self.orbit, shown, self._buttons(), self._text(legend))
         if clicked is not None:

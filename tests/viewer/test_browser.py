@@ -12,13 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import canvas_part, is_empty, open_browser, requests_of, screenshot, until
+from meshes import joined, parallelogram
 from ports import some_port
 from tiny_recording import CONFIG, make_frames
 
 from taichi_unifusion.language.embeddings import read_embeddings
 from taichi_unifusion.pipeline import Pipeline
+from taichi_unifusion.rendering.look import Look
 from taichi_unifusion.viewer.page import write_page
 from taichi_unifusion.viewer.results_scene import open_scene
+from taichi_unifusion.viewer.scene import Layer, Scene, SceneMesh
 from taichi_unifusion.viewer.source import ResultsSource
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'taichi-unifusion[viewer]'")
@@ -26,6 +29,7 @@ pytest.importorskip("viser", reason="the page needs viser: pip install 'taichi-u
 from taichi_unifusion.viewer.web import WebViewer
 from taichi_unifusion.viewer.web_live import WebLive
 from taichi_unifusion.viewer.web_page import ResultsPage
+from taichi_unifusion.viewer.web_stage import Stage
 
 STEP, SHARE = 30, 0.01  # two pictures differ if so many pixels do, by so many steps of 255
 
@@ -72,6 +76,13 @@ def settled(browser: Any, viewer: WebViewer | None = None) -> np.ndarray:
     return pictures[-1]
 
 
+def hide_notes(browser: Any) -> None:
+    """Take away what viser says over the scene, as that there is no graphics card."""
+    browser.execute_script(
+        "document.querySelectorAll('[class*=Notification-root]').forEach(e => e.style.display = 'none')"
+    )
+
+
 def differ(one: np.ndarray, other: np.ndarray) -> bool:
     changed = np.abs(one.astype(int) - other).max(axis=2) > STEP
     return float(changed.mean()) > SHARE
@@ -115,6 +126,55 @@ def test_the_page_shows_the_surface_and_its_controls(shown):
     for word in ("Layer", "Cut above", "Ask", "Click on the surface", "triangles"):
         assert word in said
     assert "Share" not in said
+
+
+PATCHES = {  # of a layer: the colours of what faces up, and of two walls
+    "color": [(228, 166, 99), (10, 12, 14), (235, 20, 10)],
+    "paint": [(128, 128, 128), (0, 60, 255), (240, 240, 60)],
+}
+VALUES = (0.0, 0.45, 1.0)  # of the same three, in the layer that has a legend
+AS_GIVEN, WITH_RELIEF = 2, 10  # steps of 255 that a drawn colour may be off
+
+
+def corner_of_a_room_from_outside() -> Scene:
+    """Three squares that look up, along x and along y, in flat colours and with flat values."""
+    axes = np.eye(3, dtype=np.float32)
+    squares = [
+        parallelogram(axes[k], axes[(k + 1) % 3], axes[(k + 2) % 3], steps=3) for k in (2, 0, 1)
+    ]
+    mesh = joined(*squares)
+    each = len(squares[0].vertices)
+    layers = [
+        Layer(name, np.repeat(np.array(colors, np.uint8), each, axis=0))
+        for name, colors in PATCHES.items()
+    ]
+    look = Look("viridis", (0.0, 1.0))
+    layers.append(Layer.of_values("value", np.repeat(VALUES, each), look))
+    return Scene("corner", (SceneMesh("corner", mesh, tuple(layers)),))
+
+
+@pytest.mark.parametrize("layer", [*PATCHES, "value"])
+def test_what_is_drawn_has_the_colours_of_the_layer_and_its_legend(browser, layer):
+    scene, viewer = corner_of_a_room_from_outside(), WebViewer(port=some_port())
+    try:
+        stage = Stage(viewer.server, scene)
+        stage.show_layer(layer)
+        viewer.server.initial_camera.position = np.array([3.0, 3.0, 3.0])
+        hide_notes(visit(browser, viewer))
+        picture = settled(browser, viewer).reshape(-1, 3).astype(int)
+    finally:
+        viewer.close()
+    legend = scene.legend(layer)
+    wanted = np.array(
+        PATCHES[layer]
+        if legend is None
+        else [legend.colors[round(255 * value)] for value in VALUES]
+    )
+    surface = picture[(picture < 250).any(axis=1)]
+    off = np.abs(surface[:, None] - wanted.astype(int)).max(axis=2)
+    most = AS_GIVEN if legend is None else WITH_RELIEF
+    drawn = (off <= most).mean(axis=0)
+    assert (drawn > 0.1).all() and drawn.sum() > 0.95, (drawn, np.unique(surface, axis=0)[::50])
 
 
 def test_another_layer_is_another_picture(shown, page):

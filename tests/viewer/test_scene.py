@@ -22,7 +22,8 @@ from taichi_unifusion.maps import SurfaceMap
 from taichi_unifusion.rendering.look import Look
 from taichi_unifusion.viewer import source as source_module
 from taichi_unifusion.viewer.results_scene import SceneOptions, open_scene
-from taichi_unifusion.viewer.scene import Layer, Scene, SceneMesh, beside, overlaid
+from taichi_unifusion.viewer.scene import Layer, Scene, SceneMesh
+from taichi_unifusion.viewer.several import beside, overlaid, with_shared_scales
 from taichi_unifusion.viewer.source import ResultsSource
 
 EIGHT_BITS = 0.5 / 255 + 1e-6
@@ -201,6 +202,46 @@ def test_scenes_beside_each_other_do_not_touch_and_say_where_they_were():
     for mesh in scene.meshes:
         assert np.allclose(mesh.mesh.vertices - mesh.offset, box(ZERO, ONE).vertices, atol=EXACT)
     assert [mesh.offset.tolist() for mesh in overlaid(cubes).meshes] == [[0.0] * 3] * 3
+
+
+def of_values(name: str, values, look: Look, classes: dict) -> Scene:
+    """A floor with a layer of values, one of classes, and one that is always the same."""
+    mesh = rectangle((0, 0), (1, 1), 0.0)
+    colors = np.array(list(classes.values()), np.uint8)
+    layers = (
+        Layer("color", np.full((4, 3), 7, np.uint8)),
+        Layer.of_values("number", np.array(values), look),
+        Layer.of_values("vector", np.outer(values, (1, 0, 0)), Look(range=None)),
+        Layer.of_values("fixed", np.zeros(4), Look(range=(0.0, 1.0))),
+        Layer.of_labels("class", np.array([0, 0, 1, -1]), tuple(classes), colors),
+    )
+    return Scene(name, (SceneMesh(name, mesh, layers),))
+
+
+@pytest.mark.parametrize("colormap", ["viridis", "diverging"])
+@pytest.mark.parametrize("together", [beside, overlaid, with_shared_scales])
+def test_results_that_are_seen_together_have_one_legend(together, colormap):
+    look = Look(colormap, None, "number [m]")
+    low = of_values("low", [0.0, 1, 2, np.nan], look, {"a": (9, 0, 0), "b": (0, 9, 0)})
+    high = of_values("high", [-1.0, 5, 6, 2], look, {"c": (0, 0, 9), "b": (0, 8, 0)})
+    shown = together([low, high])
+    meshes = shown.meshes if isinstance(shown, Scene) else [each.meshes[0] for each in shown]
+    for name in ("number", "vector", "class"):
+        one, two = (mesh.layer(name) for mesh in meshes)
+        assert one.legend is two.legend and one.legend.label.endswith("one scale for all")
+        by_value = {}
+        for layer in (one, two):
+            for value, color in zip(layer.values.tolist(), layer.colors.tolist(), strict=True):
+                assert by_value.setdefault(str(value), color) == color
+    number, classes = meshes[0].layer("number"), meshes[0].layer("class")
+    assert number.legend.low <= -0.9 and number.legend.high >= 5.9
+    share = (2 - number.legend.low) / (number.legend.high - number.legend.low)
+    row = number.legend.colors[round(255 * share)].astype(int)
+    assert np.abs(number.colors[2] - row).max() <= 2
+    assert classes.legend.names == ("a", "b", "c") and classes.describe(classes.values[2]) == "b"
+    assert meshes[1].layer("class").colors[:3].tolist() == [[0, 0, 9], [0, 0, 9], [0, 9, 0]]
+    assert "one scale" not in meshes[0].layer("fixed").legend.label
+    assert low.legend("number").high < 2.1  # alone it keeps its own
 
 
 def test_a_part_holds_the_triangles_inside_with_their_values():

@@ -16,7 +16,8 @@ from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.files.meshes import write_mesh
 from taichi_unifusion.language.embeddings import read_embeddings
 from taichi_unifusion.viewer.parts import upright
-from taichi_unifusion.viewer.scene import Legend, beside
+from taichi_unifusion.viewer.scene import Legend
+from taichi_unifusion.viewer.several import beside
 from taichi_unifusion.viewer.source import ResultsSource
 from taichi_unifusion.viewer.web_text import legend_html, paragraph
 
@@ -284,6 +285,18 @@ def test_results_side_by_side_share_layers_and_can_be_hidden(viewer, results):
     page.ask.text.value = "green"
     page.ask.ask()
     assert [nodes.current for nodes in page.stage.nodes] == ["query: green", "color"]
+
+
+def test_a_mesh_that_is_extracted_again_keeps_one_scale_with_its_neighbours(viewer, results):
+    sources = [source_of(results), ResultsSource(results.path / SCENE_FILE)]
+    page = ResultsPage(viewer, beside([source.open() for source in sources]), sources)
+    page.layers.show("height")
+    page.layers.resolution.value = 1
+    page.layers._extract(None)
+    one, two = (mesh.layer("height").legend for mesh in page.scene.meshes)
+    assert (one.low, one.high, one.label) == (two.low, two.high, two.label)
+    for nodes, mesh in zip(page.stage.nodes, page.scene.meshes, strict=True):
+        assert nodes.layers["height"].layer is mesh.layer("height")
 
 
 def test_words_of_files_are_escaped():
