@@ -47,9 +47,11 @@ def main() -> int:
 
 
 def _hear_no_more() -> None:
-    """Once Python takes itself apart it hears no signals, and one would end the process by itself."""
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    """Once Python takes itself apart it hears no signals, and one would end the process by itself:
+    ignored, not blocked, since other threads would take what this one blocks.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def open_what_is_closed() -> None:

@@ -86,25 +86,34 @@ def _show_page(scene: Scene, sources: list[ResultsSource], options: View) -> int
     from ..viewer.web import WebViewer
     from ..viewer.web_page import ResultsPage
 
-    viewer = WebViewer(options.page.host, options.page.port, scene.name)
-    try:
-        page = ResultsPage(viewer, scene, sources)
-        for text in options.query:
-            if page.ask is None:
-                raise InputError(NOTHING_TO_ASK.format(scene.name))
-            page.ask.put(text)
-        viewer.announce(open_browser=not options.page.no_open)
-        viewer.serve()
-    finally:
-        viewer.close()
+    with stop_on_signal(clean_up=lambda: _remove_temporaries(sources), viewer=True) as stop:
+        viewer = WebViewer(options.page.host, options.page.port, scene.name)
+        try:
+            page = ResultsPage(viewer, scene, sources)
+            for text in options.query:
+                if page.ask is None:
+                    raise InputError(NOTHING_TO_ASK.format(scene.name))
+                page.ask.put(text)
+            viewer.announce(open_browser=not options.page.no_open)
+            viewer.serve(stop)
+        finally:
+            viewer.close()
     return DONE
+
+
+def _remove_temporaries(sources: list[ResultsSource]) -> None:
+    """Remove what a process that ends at once leaves of the files that a page writes."""
+    from ..results.safe_point import remove_temporaries
+
+    for source in sources:
+        if source.folder is not None:
+            remove_temporaries(source.folder)
 
 
 def _show_window(scene: Scene, sources: list[ResultsSource], texts: tuple[str, ...]) -> int:
     """Results in a window, until it is closed or Ctrl-C."""
     from ..viewer.window import SceneWindow
 
-    window = SceneWindow(scene.name)
     asked = next((source for source in sources if source.has_features), None)
 
     def ask(text: str) -> ShownAnswer:
@@ -112,16 +121,17 @@ def _show_window(scene: Scene, sources: list[ResultsSource], texts: tuple[str, .
             raise InputError(NOTHING_TO_ASK.format(scene.name))
         return asked.ask(scene.meshes[sources.index(asked)], text)
 
-    try:
-        window.put(scene)
-        for text in texts:
-            found = ask(text)
-            print("\n".join([found.sentence, *found.rows]), flush=True)
-            window.answer(found)
-        with stop_on_signal(clean_up=lambda: None) as stop:
+    with stop_on_signal(clean_up=lambda: None, viewer=True) as stop:
+        window = SceneWindow(scene.name)
+        try:
+            window.put(scene)
+            for text in texts:
+                found = ask(text)
+                print("\n".join([found.sentence, *found.rows]), flush=True)
+                window.answer(found)
             window.serve(ask if asked is not None else None, stop)
-    finally:
-        window.close()
+        finally:
+            window.close()
     return DONE
 
 

@@ -132,5 +132,6 @@ def run_watched(
     if code == INTERRUPTED:
         watcher.close()
     else:
-        watcher.finish(folder.path)
+        with stop_on_signal(clean_up=lambda: remove_temporaries(folder), viewer=True) as stop:
+            watcher.finish(folder.path, stop)
     return code

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -19,9 +20,9 @@ class Watcher(Protocol):
     def on_skip(self, skipped: SkippedFrame) -> None:
         """A frame was not used."""
 
-    def finish(self, directory: Path) -> None:
+    def finish(self, directory: Path, stop: Callable[[], bool] = lambda: False) -> None:
         """The run is over, and its results lie in a folder; comes back when nobody watches any
-        more.
+        more, or `stop` says so.
         """
 
     def close(self) -> None:
@@ -37,7 +38,7 @@ class NullViewer:
     def on_skip(self, skipped: SkippedFrame) -> None:
         return None
 
-    def finish(self, directory: Path) -> None:
+    def finish(self, directory: Path, stop: Callable[[], bool] = lambda: False) -> None:
         return None
 
     def close(self) -> None:

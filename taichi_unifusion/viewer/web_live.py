@@ -86,7 +86,7 @@ class WebLive:
         self.skipped.append(skipped)
         self.viewer.poll()
 
-    def finish(self, directory: Path) -> None:
+    def finish(self, directory: Path, stop: Callable[[], bool] = lambda: False) -> None:
         """Show the results in place of what has grown, until Ctrl-C."""
         source = self.open_results(directory)
         try:
@@ -98,7 +98,7 @@ class WebLive:
             self._clear()
             ResultsPage(self.viewer, scene, [source])
         logger.info("the run is over; the page stays at %s until Ctrl-C", self.viewer.address)
-        self.viewer.serve()
+        self.viewer.serve(stop)
         self.viewer.close()
 
     def close(self) -> None:

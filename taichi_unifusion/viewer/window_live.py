@@ -72,7 +72,7 @@ class WindowLive:
         self.skipped += 1
         self._draw()
 
-    def finish(self, directory: Path) -> None:
+    def finish(self, directory: Path, stop: Callable[[], bool] = lambda: False) -> None:
         """Show the results in place of what has grown, until the window is closed."""
         if not self.window.open:
             return self.close()
@@ -86,7 +86,7 @@ class WindowLive:
             self.window.put(scene)
             self.window.said = "the run is over: these are its results"
         logger.info("the run is over; ESC in the window, or Ctrl-C, ends it")
-        self.window.serve(stop=self.stop)
+        self.window.serve(stop=stop)
         self.close()
 
     def close(self) -> None:

@@ -7,9 +7,11 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
+from ports import some_port
 from tiny_recording import CONFIG, DEVICE, make_frames
 
 from taichi_unifusion.files.mesh_reading import read_mesh
@@ -75,6 +77,27 @@ WRITING = """
 from taichi_unifusion.files import atomic
 atomic._flush_to_disk = lambda path: wait()
 """
+# a viewer says that it is there, and waits
+PAGE = """
+from taichi_unifusion.viewer import web
+def announce(self, open_browser):
+    sys.stderr.write("now\\n")
+    sys.stderr.flush()
+web.WebViewer.announce = announce
+"""
+WINDOW = """
+from taichi_unifusion.viewer import window
+class Window:
+    def __init__(self, title): pass
+    def put(self, scene): pass
+    def close(self): pass
+    def serve(self, ask, stop):
+        sys.stderr.write("now\\n")
+        sys.stderr.flush()
+        while not stop():
+            time.sleep(0.05)
+window.SceneWindow = Window
+"""
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +108,10 @@ def made(tmp_path_factory):
     return out
 
 
-def signalled(moment: str, number: signal.Signals, *arguments: str) -> tuple[int, str]:
-    """Exit code and stderr of a command that gets a signal at a moment."""
+def signalled(
+    moment: str, number: signal.Signals, *arguments: str, times: int = 1
+) -> tuple[int, str]:
+    """Exit code and stderr of a command that gets a signal at a moment, so many times."""
     process = subprocess.Popen(
         [sys.executable, "-c", START.format(moment), *arguments],
         cwd=ROOT,
@@ -98,7 +123,9 @@ def signalled(moment: str, number: signal.Signals, *arguments: str) -> tuple[int
     watchdog.start()
     try:
         assert any(line == "now\n" for line in process.stderr)
-        process.send_signal(number)
+        for _ in range(times):
+            process.send_signal(number)
+            time.sleep(0.02)
         said = process.stderr.read()
         return process.wait(), said
     finally:
@@ -123,6 +150,21 @@ def test_c16_R3_R4_a_signal_waits_until_taichi_is_imported(number, tmp_path):
     out = str(tmp_path / "out")
     ended, said = signalled(TAICHI, number, "reconstruct", "synthetic", "--end", "1", "--out", out)
     assert ended == 130 and said == "unifusion: error: stopped\n"
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("times", [1, 2])  # `timeout` sends two
+def test_a_signal_is_the_usual_end_of_a_page(number, times, made):
+    pytest.importorskip("viser", reason="the page needs viser")
+    words = ["view", str(made), "--port", str(some_port()), "--no-open"]
+    ended, said = signalled(PAGE, number, *words, times=times)
+    assert ended == 0 and said == "\nunifusion: closed\n"
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_is_the_usual_end_of_a_window(number, made):
+    ended, said = signalled(WINDOW, number, "view", str(made), "--window")
+    assert ended == 0 and said == "\nunifusion: closed\n"
 
 
 def test_c16_R4_a_signal_while_mesh_writes_leaves_no_temporary_file(made, tmp_path):

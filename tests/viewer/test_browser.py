@@ -257,7 +257,7 @@ def test_a_run_is_watched_until_its_results(browser, results, monkeypatch):
     viewer = WebViewer(port=some_port())
     frames = make_frames(6)
     live = WebLive(viewer, len(frames), lambda: False)
-    monkeypatch.setattr(viewer, "serve", lambda: None)
+    monkeypatch.setattr(viewer, "serve", lambda stop: None)
     monkeypatch.setattr(viewer, "close", lambda: None)
     try:
         browser.get(viewer.address)

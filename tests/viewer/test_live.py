@@ -171,7 +171,7 @@ def test_the_page_ends_with_the_results(live_page, results, frames, monkeypatch)
     pipeline = Pipeline(CONFIG)
     pipeline.run(frames[:2], on_step=live_page.on_step)
     served = []
-    monkeypatch.setattr(live_page.viewer, "serve", lambda: served.append("until Ctrl-C"))
+    monkeypatch.setattr(live_page.viewer, "serve", lambda stop: served.append("until Ctrl-C"))
     live_page.finish(results.path)
     assert served and live_page.nodes == {}
     scene = live_page.viewer.server.scene
