@@ -13,6 +13,7 @@ from ..types import Mesh
 from .scene import Scene, SceneMesh
 
 MEASURED = 3000  # vertices of the whole mesh whose distance to the reduced one is measured
+LEAST_SAID = 1e-4  # [m]; what is less is said to be under that
 
 
 def decimate_scene(scene: Scene, triangles: int) -> Scene:
@@ -37,8 +38,8 @@ def decimate(shown: SceneMesh, triangles: int) -> SceneMesh:
     rows = np.asarray(KDTree(whole.vertices).query(mesh.vertices)[1])
     mean, most = _off(whole.vertices, mesh)
     note = (
-        f"{len(mesh.faces):,} of {len(whole.faces):,} triangles are shown: {1e3 * mean:.1f} mm off the whole mesh in "
-        f"the mean, 99 % within {1e3 * most:.1f} mm"
+        f"{len(mesh.faces):,} of {len(whole.faces):,} triangles are shown: {_said(mean)} off the whole mesh in the "
+        f"mean, 99 % within {1e3 * max(most, LEAST_SAID):.1f} mm"
     )
     layers = tuple(layer.take(rows) for layer in shown.layers)
     return replace(shown, mesh=mesh, layers=layers, note=_joined(shown.note, note))
@@ -49,6 +50,11 @@ def _off(points: NDArray, mesh: Mesh) -> tuple[float, float]:
     chosen = np.linspace(0, len(points) - 1, min(len(points), MEASURED)).astype(int)
     distances = SurfaceDistance(mesh.vertices, mesh.faces)(points[chosen])
     return float(distances.mean()), float(np.percentile(distances, 99))
+
+
+def _said(length: float) -> str:
+    """A length [m] in words, to a tenth of a millimetre."""
+    return f"{1e3 * length:.1f} mm" if length >= LEAST_SAID else f"under {1e3 * LEAST_SAID:.1f} mm"
 
 
 def _joined(*notes: str) -> str:

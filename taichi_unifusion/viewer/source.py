@@ -91,7 +91,9 @@ class ResultsSource:
 
     @property
     def page(self) -> Path:
-        """Where a page to share is written."""
+        """Where a page to share is written; raises FileError where the results are gone, as do those
+        below.
+        """
         return self._beside.page
 
     def next_part(self) -> Path:
@@ -103,7 +105,12 @@ class ResultsSource:
 
     @property
     def _beside(self) -> RunFolder:
+        self._check_there()
         return self.folder or RunFolder(self.path.parent)
+
+    def _check_there(self) -> None:
+        if not self.path.exists():
+            raise FileError(f"{self.path}: is gone; it was there when this page was opened")
 
     def extract(
         self,
@@ -171,6 +178,7 @@ class ResultsSource:
 
     @property
     def _folder(self) -> RunFolder:
+        self._check_there()
         if self.folder is None:
             raise InputError(f"{self.path}: is a mesh; give a results folder")
         return self.folder

@@ -40,7 +40,8 @@ class LayerPanel:
         self.height.on_update(lambda _: request(self._cut))
         self.cameras = gui.add_checkbox("Cameras", False, disabled=not stage.scene.cameras)
         self.cameras.on_update(lambda event: request(self.show_cameras, event.client))
-        if any(source.has_maps for source in results.sources):
+        self.with_maps = [i for i, source in enumerate(results.sources) if source.has_maps]
+        if self.with_maps:
             self.resolution = gui.add_slider("Cells a voxel", 1, 8, 1, 4)
             again = gui.add_button("Extract the mesh again")
             again.on_click(lambda event: request(lambda: self._extract(event.client), event.client))
@@ -92,11 +93,13 @@ class LayerPanel:
     def _extract(self, client: viser.ClientHandle | None) -> None:
         results, resolution = self.results, int(self.resolution.value)
         self.progress.value, self.progress.visible = 0.0, True
-        for i, source in enumerate(results.sources):
-            if source.has_maps:
-                whole = source.extract(results.scene, results.wholes[i], resolution, self._piece)
+        try:
+            for i in self.with_maps:
+                shown = results.wholes[i]
+                whole = results.sources[i].extract(results.scene, shown, resolution, self._piece)
                 results.replace_mesh(i, whole)
-        self.progress.visible = False
+        finally:
+            self.progress.visible = False
         self.refresh()
         results.viewer.say("Extracted", f"{results.scene.triangles:,} triangles are shown", client)
 

@@ -36,6 +36,7 @@ class AskPanel:
         )
         self.said = gui.add_html("")
         self.rows: list[Any] = []
+        self.with_features = [i for i, each in enumerate(results.sources) if each.has_features]
         self.folder = gui.add_folder("Answers", visible=False)
 
     def put(self, text: str) -> None:
@@ -60,7 +61,7 @@ class AskPanel:
         answers: list[tuple[int, ShownAnswer]] = []
         try:
             for i, source in enumerate(results.sources):
-                if source.has_features:
+                if i in self.with_features:
                     answers.append((i, source.ask(results.scene.meshes[i], text)))
         except UniFusionError as error:
             self.said.content = paragraph(str(error))

@@ -4,6 +4,7 @@ answered; the shared page opens without a server.
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -297,5 +298,18 @@ def test_the_shared_page_opens_from_a_file_and_asks_for_nothing(browser, results
     camera = Select(browser.find_element(By.ID, "camera"))
     camera.select_by_visible_text("frame 1")
     click_on_surface(browser, lambda: "position" in text_of(browser))
+    rows = [
+        row.text.split(maxsplit=1) for row in browser.find_elements(By.CSS_SELECTOR, "#point tr")
+    ]
+    said = dict(rows)
+    assert len(said) == len(rows) and "normals" not in said
+    assert re.fullmatch(r"-?\d+\.\d{3} m", said["height"])
+    normal = [float(part) for part in said["normal"].split(", ")]
+    assert abs(np.linalg.norm(normal) - 1) < 0.02
+    assert re.fullmatch(r"\d+, \d+, \d+ \(#[0-9a-f]{6}\)", said["color"])
+    edges = "a => document.querySelector(a).getBoundingClientRect()"
+    assert browser.execute_script(
+        f"const at = {edges}; return at('canvas').right <= at('#panel').left"
+    )
     assert [url for url in requests_of(browser) if not url.startswith("data:")] == [address]
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import logging
+import shutil
 
 import numpy as np
 import pytest
@@ -265,6 +266,21 @@ def test_a_page_to_share_is_written_beside_the_results(viewer, results, tmp_path
     page.keep.write_page(None)
     assert (tmp_path / "page.html").stat().st_size > 10_000
     assert str(tmp_path / "page.html") in page.keep.said.content
+
+
+def test_results_that_are_gone_get_nothing_written_elsewhere(viewer, results, tmp_path, caplog):
+    gone = shutil.copytree(results.path, tmp_path / "gone")
+    source = ResultsSource(gone)
+    page = ResultsPage(viewer, source.open(), [source])
+    shutil.rmtree(gone)
+    viewer.request(lambda: page.keep.write_page(None))
+    viewer.request(page.part.write)
+    viewer.request(lambda: page.layers._extract(None))
+    page.point.click(*ray_of(page, 0))
+    viewer.poll()
+    assert caplog.text.count(f"{gone}: is gone") == 3
+    assert list(tmp_path.iterdir()) == [] and "position" in page.point.said.content
+    assert not page.layers.progress.visible
 
 
 # ---- several results ----
