@@ -34,7 +34,7 @@ from .value_scale import exponents_for, fits, steps_for
 
 # A window ends where the camera has moved this far from its first frame [m, degrees]: from there
 # fewer voxels are shared, and a window that a loop moves would bend.
-FARTHEST_MOVE, LARGEST_TURN = 1.0, 50.0
+FARTHEST_MOVE, LARGEST_TURN = 0.6, 30.0
 GAP = 3  # a step between frames that is so many times the usual one ends a window
 ROOM = 256 << 20  # bytes of a part's sums, or of depth images, beyond which a window ends
 VOTE_PIECES = 20
