@@ -93,8 +93,8 @@ def picture_page(options: argparse.Namespace, browser: Any) -> None:
         page.layers.height.value = options.cut
         page.stage.cut_above(options.cut)
     if options.cameras:
-        page.layers.cameras.value = True
-        page.layers.show_cameras()
+        page.layers.cameras.shown.value = True
+        page.layers.cameras.show()
     if options.ask:
         page.ask.put(options.ask)
     wait_still(browser, viewer.poll)

@@ -140,6 +140,6 @@ def _import_av() -> ModuleType:
         import av
     except ImportError:
         raise MissingDependency(
-            "recordings of an Azure Kinect are read with PyAV: pip install av"
+            "recordings of an Azure Kinect are read with PyAV: pip install 'taichi-unifusion[k4a]'"
         ) from None
     return av

@@ -1,14 +1,11 @@
-"""The controls of a page that choose what is seen: which layer and results, how high, how fine, the
-cameras.
-"""
+"""The controls of a page that choose what is seen: which layer and results, how high, how fine."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .scene import SceneCamera
+from .web_cameras import CameraPanel
 from .web_results import ShownResults
-from .web_stage import quaternion_of
 from .web_text import legend_html, paragraph
 
 if TYPE_CHECKING:
@@ -38,8 +35,7 @@ class LayerPanel:
             "Cut above [m]", round(low, 3), round(high + step, 3), step, round(high + step, 3)
         )
         self.height.on_update(lambda _: request(self._cut))
-        self.cameras = gui.add_checkbox("Cameras", False, disabled=not stage.scene.cameras)
-        self.cameras.on_update(lambda event: request(self.show_cameras, event.client))
+        self.cameras = CameraPanel(results)
         self.with_maps = [i for i, source in enumerate(results.sources) if source.has_maps]
         if self.with_maps:
             self.resolution = gui.add_slider("Cells a voxel", 1, 8, 1, 4)
@@ -75,21 +71,6 @@ class LayerPanel:
     def _cut(self) -> None:
         self.results.stage.cut_above(self.height.value)
 
-    def show_cameras(self) -> None:
-        """Draw the cameras with what they saw, or take them away, as the box says."""
-        stage, viewer = self.results.stage, self.results.viewer
-        if not self.cameras.value:
-            stage.hide_cameras()
-            return
-        if len(self.results.sources) == 1 and not any(
-            each.image is not None for each in stage.scene.cameras
-        ):
-            stage.scene = self.results.sources[0].with_images(stage.scene)
-        stage.show_cameras(
-            stage.scene.cameras,
-            lambda client, camera: viewer.request(lambda: look_from(client, camera), client),
-        )
-
     def _extract(self, client: viser.ClientHandle | None) -> None:
         results, resolution = self.results, int(self.resolution.value)
         self.progress.value, self.progress.visible = 0.0, True
@@ -105,10 +86,3 @@ class LayerPanel:
 
     def _piece(self, done: int, total: int) -> None:
         self.progress.value = 100 * done / total
-
-
-def look_from(client: viser.ClientHandle, camera: SceneCamera) -> None:
-    """Put the camera of a page where one of the recording was."""
-    with client.atomic():
-        client.camera.wxyz = quaternion_of(camera.T_world_camera)
-        client.camera.position = camera.T_world_camera[:3, 3]

@@ -72,15 +72,13 @@ class WebLive:
         self.path.append(frame.require_pose()[:3, 3])
         self.viewer.poll()
         if self.pace.ready():
-            started = time.perf_counter()
-            chunks = self.chunks.take(pipeline, frame, self.pace.blocks())
-            self._show(chunks)
-            self._tell(frame, step)
-            self.updates += 1
-            self.pace.took(time.perf_counter() - started, len(chunks))
+            self._update(frame, step, pipeline)
         while self.paused and not self.stop():
             self.viewer.poll()
-            time.sleep(WAIT / 4)
+            if self.chunks.waiting:  # the run has no use for the time now
+                self._update(frame, step, pipeline)
+            else:
+                time.sleep(WAIT / 4)
 
     def on_skip(self, skipped: SkippedFrame) -> None:
         self.skipped.append(skipped)
@@ -103,6 +101,15 @@ class WebLive:
 
     def close(self) -> None:
         self.viewer.close()
+
+    def _update(self, frame: Frame, step: StepResult, pipeline: Pipeline) -> None:
+        """Mesh some of what has changed, and show it."""
+        started = time.perf_counter()
+        chunks = self.chunks.take(pipeline, frame, self.pace.blocks())
+        self._show(chunks)
+        self._tell(frame, step)
+        self.updates += 1
+        self.pace.took(time.perf_counter() - started, len(chunks))
 
     def _show(self, chunks: Any) -> None:
         scene = self.viewer.server.scene

@@ -47,6 +47,16 @@ class ResultsPage:
             self.part = PartPanel(results)
         with gui.add_folder("Keep", expand_by_default=False):
             self.keep = KeepPanel(results)
+        viewer.server.on_client_connect(lambda _: viewer.request(self.greet))
+
+    def greet(self) -> None:
+        """Take old messages away where somebody opens the page, and nobody else reads them."""
+        if len(self.viewer.server.get_clients()) > 1:
+            return
+        self.layers.cameras.leave()
+        for panel in (self.ask, self.point, self.part, self.keep):
+            if panel is not None:
+                panel.forget_message()
 
     @property
     def scene(self) -> Scene:
@@ -67,6 +77,10 @@ class KeepPanel:
         share = gui.add_button("Write a page to share (HTML)")
         share.on_click(lambda event: request(lambda: self.write_page(event.client), event.client))
         self.said = gui.add_html("")
+
+    def forget_message(self) -> None:
+        """Say no more what was written."""
+        self.said.content = ""
 
     def save_picture(self, client: viser.ClientHandle | None) -> None:
         """Let the browser save what it shows."""

@@ -44,6 +44,11 @@ class AskPanel:
         self.text.value = text
         self.ask()
 
+    def forget_message(self) -> None:
+        """Say no more why there was no answer; one that is shown keeps its words."""
+        if not self.rows:
+            self.said.content = ""
+
     def _typed(self, client: viser.ClientHandle | None) -> None:
         """Ask once Enter has been pressed, which ends the line."""
         if "\n" in self.text.value:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..geometry.quaternions import rotation_to_quaternion
 from ..types import PinholeCamera
 from .picking import Hit, Picker
-from .scene import Box, Label, Scene, SceneCamera, SceneMesh
+from .scene import Box, Label, Scene, SceneMesh
 from .web_nodes import BANDS, MeshNodes
 
 if TYPE_CHECKING:
@@ -120,12 +120,10 @@ class Stage:
                     self.pickers[i] = Picker(self.scene.meshes[i], nodes.kept)
                 yield i, self.pickers[i]
 
-    def show_cameras(
-        self, cameras: Iterable[SceneCamera], on_click: Callable[[Any, SceneCamera], None]
-    ) -> None:
-        """Draw cameras as outlines with their images; `on_click` is told of a client and a camera."""
+    def show_cameras(self, on_click: Callable[[Any, int], None]) -> None:
+        """Draw cameras as outlines with their images; `on_click` is told of a client and which one."""
         self.hide_cameras()
-        for i, camera in enumerate(cameras):
+        for i, camera in enumerate(self.scene.cameras):
             pinhole = camera.camera
             handle = self.server.scene.add_camera_frustum(
                 f"/camera{i}",
@@ -140,8 +138,21 @@ class Stage:
                 position=camera.T_world_camera[:3, 3],
                 cast_shadow=False,
             )
-            handle.on_click(lambda event, camera=camera: on_click(event.client, camera))
+            handle.on_click(lambda event, i=i: on_click(event.client, i))
             self.cameras.append(handle)
+
+    def look_through(self, number: int | None) -> None:
+        """Draw one camera alone, and without its image, which would hide what lies behind; None: all
+        of them as they were.
+        """
+        with self.server.atomic():
+            for i, handle in enumerate(self.cameras):
+                handle.visible = number is None or i == number
+                image = self.scene.cameras[i].image
+                if number == i:
+                    handle.image = None
+                elif handle.image is None and image is not None:
+                    handle.image = image
 
     def hide_cameras(self) -> None:
         """Take the cameras away."""

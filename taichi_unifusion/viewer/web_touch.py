@@ -66,6 +66,11 @@ class PointPanel:
         self.said.content = table(rows)
         self.last = hit
 
+    def forget_message(self) -> None:
+        """Say no more that a click met nothing; points that are marked keep their words."""
+        if self.last is None:
+            self.said.content = paragraph(INVITATION)
+
     def clear(self) -> None:
         """Forget the points."""
         self.last = None
@@ -116,6 +121,12 @@ class PartPanel:
             return
         self.low.value, self.high.value = tuple(corners[0]), tuple(corners[1])
         self.measure()
+
+    def forget_message(self) -> None:
+        """Say no more what was written, but how large the box is, if one is drawn."""
+        self.said.content = ""
+        if self.results.stage.marked.get(PART):
+            self.measure()
 
     @property
     def corners(self) -> np.ndarray:

@@ -57,16 +57,23 @@ class WindowLive:
         if not self.window.open:
             return
         if self.pace.ready():
-            started = time.perf_counter()
-            taken = self.changes.take(pipeline, frame, self.pace.blocks())
-            self.chunks.update(taken)
-            self._put(frame, step)
-            self._draw(due=True)
-            self.pace.took(time.perf_counter() - started, len(taken))
+            self._update(frame, step, pipeline)
         self._draw()
         while self.paused and not self.stop() and self.window.open:
             self.window.poll()
-            time.sleep(QUICKEST)
+            if self.changes.waiting:  # the run has no use for the time now
+                self._update(frame, step, pipeline)
+            else:
+                time.sleep(QUICKEST)
+
+    def _update(self, frame: Frame, step: StepResult, pipeline: Pipeline) -> None:
+        """Mesh some of what has changed, and draw it."""
+        started = time.perf_counter()
+        taken = self.changes.take(pipeline, frame, self.pace.blocks())
+        self.chunks.update(taken)
+        self._put(frame, step)
+        self._draw(due=True)
+        self.pace.took(time.perf_counter() - started, len(taken))
 
     def on_skip(self, skipped: SkippedFrame) -> None:
         self.skipped += 1

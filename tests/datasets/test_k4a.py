@@ -224,7 +224,7 @@ def test_without_pyav_one_sentence_says_what_to_install(recording, monkeypatch):
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(MissingDependency, match=r"pip install av"):
+    with pytest.raises(MissingDependency, match=r"pip install .taichi-unifusion\[k4a\]"):
         open_dataset("k4a", recording)
 
 

@@ -167,6 +167,19 @@ def test_a_run_that_is_paused_goes_on_when_told(live_page, frames):
     pipeline.run(frames[1:2], on_step=live_page.on_step)
 
 
+def test_a_run_that_is_paused_meshes_what_waits(live_page, frames, monkeypatch):
+    from taichi_unifusion.viewer import live
+
+    monkeypatch.setattr(live, "LEAST_BLOCKS", 1)
+    asked = iter([False] * 200)
+    live_page.stop = lambda: not live_page.chunks.waiting or next(asked, True)
+    live_page.paused = True
+    pipeline = Pipeline(replace(CONFIG, window=2))
+    pipeline.run(frames[:4], on_step=live_page.on_step)
+    assert live_page.updates > 4 and not live_page.chunks.waiting
+    assert "0 blocks" in live_page.said.content
+
+
 def test_the_page_ends_with_the_results(live_page, results, frames, monkeypatch):
     pipeline = Pipeline(CONFIG)
     pipeline.run(frames[:2], on_step=live_page.on_step)

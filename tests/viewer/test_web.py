@@ -5,6 +5,9 @@ from __future__ import annotations
 import http.client
 import logging
 import shutil
+import time
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -168,13 +171,36 @@ def test_the_mesh_is_extracted_again_finer_or_coarser(page):
 
 
 def test_cameras_come_with_what_they_saw_and_go(page):
-    page.layers.cameras.value = True
-    page.layers.show_cameras()
+    page.layers.cameras.shown.value = True
+    page.layers.cameras.show()
     assert len(page.stage.cameras) == 3
     assert all(camera.image is not None for camera in page.scene.cameras)
-    page.layers.cameras.value = False
-    page.layers.show_cameras()
+    page.layers.cameras.shown.value = False
+    page.layers.cameras.show()
     assert page.stage.cameras == []
+
+
+def test_who_looks_from_a_camera_sees_the_map_its_outline_and_the_picture_beside(page):
+    cameras, drawn = page.layers.cameras, page.stage.cameras
+    cameras.shown.value = True
+    while not page.viewer.poll():  # the box asks for them
+        time.sleep(0.01)
+    client = SimpleNamespace(camera=SimpleNamespace(), client_id=5, atomic=nullcontext)
+    cameras.look_from(client, 1)
+    assert [each.visible for each in drawn] == [False, True, False] and drawn[1].image is None
+    assert np.array_equal(cameras.image.image, page.scene.cameras[1].image)
+    assert cameras.image.visible and "frame 1" in cameras.name.content
+    away = client.camera.position + page.stage.size
+    for position, left in ((away, False), (client.camera.position, False), (away, True)):
+        client.camera.position = position
+        cameras._moved(client)
+        page.viewer.poll()
+        assert all(each.visible for each in drawn) is left
+    assert all(each.image is not None for each in drawn) and not cameras.image.visible
+    cameras.look_from(client, 2)
+    cameras.shown.value = False
+    cameras.show()
+    assert page.stage.cameras == [] and not cameras.image.visible
 
 
 # ---- questions ----
@@ -266,6 +292,23 @@ def test_a_page_to_share_is_written_beside_the_results(viewer, results, tmp_path
     page.keep.write_page(None)
     assert (tmp_path / "page.html").stat().st_size > 10_000
     assert str(tmp_path / "page.html") in page.keep.said.content
+
+
+def test_a_new_page_shows_what_was_chosen_without_old_messages(page):
+    page.layers.show("height")
+    page.point.click(*ray_of(page, 0))
+    clicked = page.point.said.content
+    page.part.measure()
+    measured = page.part.said.content
+    page.part.said.content = page.keep.said.content = page.ask.said.content = "page.html: old"
+    page.greet()
+    assert page.keep.said.content == page.ask.said.content == ""
+    assert (page.part.said.content, page.point.said.content) == (measured, clicked)
+    assert page.layers.layer.value == "height"
+    page.point.clear()
+    page.point.click(np.zeros(3) + 100, np.array([0.0, 0, 1]))
+    page.greet()
+    assert "Click on the surface" in page.point.said.content
 
 
 def test_results_that_are_gone_get_nothing_written_elsewhere(viewer, results, tmp_path, caplog):
