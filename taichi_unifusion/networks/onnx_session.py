@@ -31,7 +31,7 @@ def open_session(file: str | Path, device: str = "auto") -> InferenceSession:
         import onnxruntime
     except ImportError:
         raise MissingDependency(
-            "ONNX models are run by onnxruntime: pip install onnxruntime"
+            "ONNX models are run by onnxruntime: pip install 'taichi-unifusion[models]'"
         ) from None
     has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
     if device == "cuda" and not has_cuda:

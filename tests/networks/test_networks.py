@@ -262,5 +262,5 @@ def test_missing_packages_are_said_with_the_command_that_installs_them(tmp_path,
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(MissingDependency, match=r"pip install onnxruntime"):
+    with pytest.raises(MissingDependency, match=r"taichi-unifusion\[models\]"):
         make_property(f"saliency=onnx:{file}")

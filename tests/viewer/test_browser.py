@@ -129,55 +129,6 @@ def test_the_page_shows_the_surface_and_its_controls(shown):
     assert "Share" not in said
 
 
-PATCHES = {  # of a layer: the colours of what faces up, and of two walls
-    "color": [(228, 166, 99), (10, 12, 14), (235, 20, 10)],
-    "paint": [(128, 128, 128), (0, 60, 255), (240, 240, 60)],
-}
-VALUES = (0.0, 0.45, 1.0)  # of the same three, in the layer that has a legend
-AS_GIVEN, WITH_RELIEF = 2, 10  # steps of 255 that a drawn colour may be off
-
-
-def corner_of_a_room_from_outside() -> Scene:
-    """Three squares that look up, along x and along y, in flat colours and with flat values."""
-    axes = np.eye(3, dtype=np.float32)
-    squares = [
-        parallelogram(axes[k], axes[(k + 1) % 3], axes[(k + 2) % 3], steps=3) for k in (2, 0, 1)
-    ]
-    mesh = joined(*squares)
-    each = len(squares[0].vertices)
-    layers = [
-        Layer(name, np.repeat(np.array(colors, np.uint8), each, axis=0))
-        for name, colors in PATCHES.items()
-    ]
-    look = Look("viridis", (0.0, 1.0))
-    layers.append(Layer.of_values("value", np.repeat(VALUES, each), look))
-    return Scene("corner", (SceneMesh("corner", mesh, tuple(layers)),))
-
-
-@pytest.mark.parametrize("layer", [*PATCHES, "value"])
-def test_what_is_drawn_has_the_colours_of_the_layer_and_its_legend(browser, layer):
-    scene, viewer = corner_of_a_room_from_outside(), WebViewer(port=some_port())
-    try:
-        stage = Stage(viewer.server, scene)
-        stage.show_layer(layer)
-        viewer.server.initial_camera.position = np.array([3.0, 3.0, 3.0])
-        hide_notes(visit(browser, viewer))
-        picture = settled(browser, viewer).reshape(-1, 3).astype(int)
-    finally:
-        viewer.close()
-    legend = scene.legend(layer)
-    wanted = np.array(
-        PATCHES[layer]
-        if legend is None
-        else [legend.colors[round(255 * value)] for value in VALUES]
-    )
-    surface = picture[(picture < 250).any(axis=1)]
-    off = np.abs(surface[:, None] - wanted.astype(int)).max(axis=2)
-    most = AS_GIVEN if legend is None else WITH_RELIEF
-    drawn = (off <= most).mean(axis=0)
-    assert (drawn > 0.1).all() and drawn.sum() > 0.95, (drawn, np.unique(surface, axis=0)[::50])
-
-
 def test_another_layer_is_another_picture(shown, page):
     from selenium.webdriver.common.by import By
 
@@ -252,6 +203,55 @@ def test_a_browser_that_comes_back_finds_the_scene(shown, page):
     until(lambda: not page.viewer.server.get_clients(), "the page to be gone", page.viewer.poll)
     visit(shown, page.viewer)
     assert "query: red" in control(shown, "Layer").get_attribute("value")
+
+
+PATCHES = {  # of a layer: the colours of what faces up, and of two walls
+    "color": [(228, 166, 99), (10, 12, 14), (235, 20, 10)],
+    "paint": [(128, 128, 128), (0, 60, 255), (240, 240, 60)],
+}
+VALUES = (0.0, 0.45, 1.0)  # of the same three, in the layer that has a legend
+AS_GIVEN, WITH_RELIEF = 2, 10  # steps of 255 that a drawn colour may be off
+
+
+def corner_of_a_room_from_outside() -> Scene:
+    """Three squares that look up, along x and along y, in flat colours and with flat values."""
+    axes = np.eye(3, dtype=np.float32)
+    squares = [
+        parallelogram(axes[k], axes[(k + 1) % 3], axes[(k + 2) % 3], steps=3) for k in (2, 0, 1)
+    ]
+    mesh = joined(*squares)
+    each = len(squares[0].vertices)
+    layers = [
+        Layer(name, np.repeat(np.array(colors, np.uint8), each, axis=0))
+        for name, colors in PATCHES.items()
+    ]
+    look = Look("viridis", (0.0, 1.0))
+    layers.append(Layer.of_values("value", np.repeat(VALUES, each), look))
+    return Scene("corner", (SceneMesh("corner", mesh, tuple(layers)),))
+
+
+@pytest.mark.parametrize("layer", [*PATCHES, "value"])
+def test_what_is_drawn_has_the_colours_of_the_layer_and_its_legend(browser, layer):
+    scene, viewer = corner_of_a_room_from_outside(), WebViewer(port=some_port())
+    try:
+        stage = Stage(viewer.server, scene)
+        stage.show_layer(layer)
+        viewer.server.initial_camera.position = np.array([3.0, 3.0, 3.0])
+        hide_notes(visit(browser, viewer))
+        picture = settled(browser, viewer).reshape(-1, 3).astype(int)
+    finally:
+        viewer.close()
+    legend = scene.legend(layer)
+    wanted = np.array(
+        PATCHES[layer]
+        if legend is None
+        else [legend.colors[round(255 * value)] for value in VALUES]
+    )
+    surface = picture[(picture < 250).any(axis=1)]
+    off = np.abs(surface[:, None] - wanted.astype(int)).max(axis=2)
+    most = AS_GIVEN if legend is None else WITH_RELIEF
+    drawn = (off <= most).mean(axis=0)
+    assert (drawn > 0.1).all() and drawn.sum() > 0.95, (drawn, np.unique(surface, axis=0)[::50])
 
 
 def test_a_run_is_watched_until_its_results(browser, results, monkeypatch):
