@@ -86,8 +86,11 @@ def extract_mesh(
         return Mesh(
             np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32)
         )
-    vertices, faces = parts[0] if len(parts) == 1 else _welded(parts)
     wanted = None if blocks is None else np.concatenate(inside)  # (F,)
+    vertices, faces = parts[0]
+    if len(parts) > 1:
+        vertices, faces, source = welded(parts)
+        wanted = None if wanted is None else wanted[source]
     if "evidence" in grid and len(faces):
         evidence = np.empty(len(vertices), np.float32)
         interpolate_evidence(
@@ -115,16 +118,20 @@ def _near(
     return _closed(codes[reached], support[reached], resolution)
 
 
-def _welded(
+def welded(
     parts: Sequence[tuple[NDArray[np.float32], NDArray[np.int32]]],
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """One mesh of two, whose vertices at the very same places are one."""
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.intp]]:
+    """One mesh of two, whose vertices at the very same places are one, and which face of both each of
+    its own is: those that have two corners at one place go.
+    """
     (vertices, faces), (more, other) = parts
     rows = np.concatenate([vertices, more])
     _, first, number = np.unique(rows.view("V12").ravel(), return_index=True, return_inverse=True)
     kept = np.sort(first)
     at = np.searchsorted(kept, first)[number.reshape(-1)].astype(np.int32)
-    return rows[kept], np.concatenate([at[faces], at[other + len(vertices)]])
+    faces = np.concatenate([at[faces], at[other + len(vertices)]])
+    proper = np.flatnonzero((faces != faces[:, [2, 0, 1]]).all(axis=1))
+    return *_without_unused(rows[kept], faces[proper]), proper
 
 
 def mesh_blocks(keys: NDArray[np.int32]) -> NDArray[np.int32]:

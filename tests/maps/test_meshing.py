@@ -7,14 +7,14 @@ from itertools import product
 import numpy as np
 import pytest
 import reference
-from mesh_laws import area_and_volume, assert_closed
+from mesh_laws import area_and_volume, assert_closed, assert_welded
 from skimage.measure import marching_cubes
 
 from taichi_unifusion.errors import InputError
 from taichi_unifusion.kernels import marching_cubes as kernels
 from taichi_unifusion.maps import SurfaceMap, meshing
 from taichi_unifusion.maps.encoding import EncoderSettings
-from taichi_unifusion.maps.meshing import drop_small_parts
+from taichi_unifusion.maps.meshing import drop_small_parts, welded
 from taichi_unifusion.maps.voxel_data import VoxelData
 from taichi_unifusion.types import Mesh
 
@@ -352,3 +352,15 @@ def test_small_parts_are_dropped_and_the_rest_is_untouched():
     np.testing.assert_array_equal(large.faces, faces[:2])
     np.testing.assert_array_equal(large.attributes["x"][:, 0], np.arange(4, 8))
     assert drop_small_parts(mesh, 0) is mesh and len(drop_small_parts(mesh, 2).faces) == 0
+
+
+def test_two_sheets_are_welded_without_faces_of_two_corners_at_one_place():
+    one = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 1, 0]], np.float32)  # the last one twice
+    other = np.array([[1, 0, 0], [0, 1, 0], [1, 1, 0], [5, 5, 5], [5, 5, 5]], np.float32)
+    faces = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+    vertices, found, source = welded(
+        [(one, faces), (other, np.array([[0, 2, 1], [2, 3, 4]], np.int32))]
+    )
+    assert_welded(vertices, found)
+    assert source.tolist() == [0, 2] and len(vertices) == 4
+    assert (vertices[found[1]] == other[[0, 2, 1]]).all()

@@ -11,6 +11,7 @@ import json
 import platform
 import sys
 import tempfile
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -80,21 +81,20 @@ def summary(array: np.ndarray) -> list[float]:
 
 
 def machine(encoding: np.ndarray) -> str:
-    """What the last bit of a sum depends on: the processor's instructions, Taichi's compiler, the
-    linear algebra library.
+    """What the last bit of a sum depends on: the processor, whose kind LLVM makes code for and whose
+    instructions it uses, Taichi's compiler, the linear algebra library.
     """
-    try:
-        flags = next(
-            line
-            for line in Path("/proc/cpuinfo").read_text().splitlines()
-            if line.startswith("flags")
-        )
-    except (OSError, StopIteration):
-        flags = platform.processor()
+    said: dict[str, str] = {}
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            name, _, value = line.partition(":")
+            said.setdefault(name.strip(), value.strip())
+    kind = "-".join(said.get(name, "") for name in ("vendor_id", "cpu family", "model"))
     vectors = sorted(
-        set(flags.split()) & {"avx", "avx2", "fma", "fma4", "xop", "avx512f", "avx512vl"}
+        set(said.get("flags", platform.processor()).split())
+        & {"avx", "avx2", "fma", "fma4", "xop", "avx512f", "avx512vl"}
     )
-    return f"taichi {version('taichi')}, {'+'.join(vectors)}, encoding {sha256(encoding)}"
+    return f"taichi {version('taichi')}, {kind} {'+'.join(vectors)}, encoding {sha256(encoding)}"
 
 
 def arrays() -> dict[str, np.ndarray]:
