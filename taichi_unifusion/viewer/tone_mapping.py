@@ -17,13 +17,15 @@ FROM_CURVE = np.array(
     [[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]]
 )
 EXPOSURE = 1 / 0.6
+LIGHT_OF_CURVE = (np.linalg.inv(TO_CURVE) / EXPOSURE).astype(np.float32)
+CURVE_OF_COLOR = np.linalg.inv(FROM_CURVE).astype(np.float32)
 # the curve: (x (x + A) - B) / (x (C x + D) + E)
 A, B, C, D, E = 0.0245786, 0.000090537, 0.983729, 0.4329510, 0.238081
 
 
 def light_that_shows(light: NDArray) -> NDArray[np.float32]:
     """What is drawn as linear light (N, 3) in [0, 1]: some of it lies below 0, or above 1."""
-    wanted = np.asarray(light, np.float64) @ np.linalg.inv(FROM_CURVE).T
+    wanted = np.asarray(light, np.float32) @ CURVE_OF_COLOR.T
     square, linear, rest = 1 - C * wanted, A - D * wanted, B + E * wanted
     on_curve = (np.sqrt(linear**2 + 4 * square * rest) - linear) / (2 * square)
-    return (on_curve @ np.linalg.inv(TO_CURVE).T / EXPOSURE).astype(np.float32)
+    return (on_curve @ LIGHT_OF_CURVE.T).astype(np.float32)

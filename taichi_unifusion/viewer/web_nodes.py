@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..files.glb import write_glb
 from ..files.srgb import LINEAR_OF_BYTE
+from ..geometry.triangles import vertex_normals
 from ..types import Mesh
 from .scene import Layer, SceneMesh
 from .tone_mapping import light_that_shows
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 BANDS = 24  # of height: a cut moves in steps of a 24th of the scene
 RELIEF = 0.12  # share of the light by which a side is lighter or darker, at most
+PLAIN_RELIEF = 0.6  # the same where no colour has a meaning: of a map without colour
 LIT_FROM = np.array([0.66, 0.36, 0.66])  # unit, in the scene: no two sides of a box look alike
 KEPT_LAYERS = 4  # of a mesh that stay in the browser; each costs some 30 MB per million triangles
 
@@ -127,8 +129,12 @@ def glb_of(mesh: Mesh, layer: Layer, kept: NDArray[np.bool_]) -> bytes:
     """
     part, rows = Mesh(mesh.vertices, mesh.faces, mesh.normals).part(kept)
     light = LINEAR_OF_BYTE[layer.colors[rows]]
-    if layer.lit and part.normals is not None:
-        light = np.clip(light * (1 + RELIEF * part.normals @ LIT_FROM)[:, None], 0, 1)
+    if layer.lit:
+        relief = RELIEF if layer.legend is not None else PLAIN_RELIEF
+        normals = part.normals
+        if normals is None:
+            normals = vertex_normals(part.vertices, part.faces)
+        light = np.clip(light * (1 + relief * normals @ LIT_FROM)[:, None], 0, 1)
     file = io.BytesIO()
     bare = Mesh(part.vertices, part.faces)
     write_glb(file, bare, light=light_that_shows(light))

@@ -4,6 +4,8 @@ results.
 
 from __future__ import annotations
 
+import json
+import struct
 import threading
 import time
 from dataclasses import replace
@@ -11,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from map_kinds import content
+from meshes import box
 from tiny_recording import CONFIG, make_frames
 
 from taichi_unifusion.cli import main as cli
@@ -154,6 +157,16 @@ def test_the_page_of_a_run_shows_mesh_camera_stages_and_what_was_skipped(live_pa
     assert "there is no pose for this frame" in said and "surface" in said and "ms" in said
     assert live_page.nodes and live_page.camera.image is not None
     assert np.allclose(live_page.camera.position, live_page.path[-1])
+
+
+def test_a_map_without_colour_is_drawn_with_its_shape():
+    pytest.importorskip("viser")
+    from taichi_unifusion.viewer.web_live import chunk_glb
+
+    data = chunk_glb(box((0.0,) * 3, (1.0,) * 3))
+    header = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    color = header["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
+    assert header["accessors"][color]["max"][0] > 1.3 * header["accessors"][color]["min"][0]
 
 
 def test_a_run_that_is_paused_goes_on_when_told(live_page, frames):
