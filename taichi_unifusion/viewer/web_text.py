@@ -68,9 +68,9 @@ def describe_hit(scene: Scene, hit: Hit, words: list[tuple[str, float]]) -> list
     x, y, z = hit.point_in_map
     rows = [("of", hit.shown.name)] if len(scene.meshes) > 1 else []
     rows += [
-        ("position", f"{x:.3f}, {y:.3f}, {z:.3f} m"),
-        ("height", f"{float(scene.heights_of(hit.point[None])[0]):.3f} m"),
-        ("normal", ", ".join(f"{part:.2f}" for part in hit.normal)),
+        ("position", f"{x:z.3f}, {y:z.3f}, {z:z.3f} m"),
+        ("height", f"{float(scene.heights_of(hit.point[None])[0]):z.3f} m"),
+        ("normal", ", ".join(f"{part:z.2f}" for part in hit.normal)),
     ]
     for layer in hit.shown.layers:
         values = hit.values(layer)

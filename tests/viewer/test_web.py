@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from colored_results import NAMES
+from meshes import rectangle
 from ports import some_port
 
 from taichi_unifusion.cli import main as cli
@@ -20,10 +21,11 @@ from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.files.meshes import write_mesh
 from taichi_unifusion.language.embeddings import read_embeddings
 from taichi_unifusion.viewer.parts import upright
-from taichi_unifusion.viewer.scene import Legend
+from taichi_unifusion.viewer.picking import Picker
+from taichi_unifusion.viewer.scene import Layer, Legend, Scene, SceneMesh
 from taichi_unifusion.viewer.several import beside
 from taichi_unifusion.viewer.source import ResultsSource
-from taichi_unifusion.viewer.web_text import legend_html, paragraph
+from taichi_unifusion.viewer.web_text import describe_hit, legend_html, paragraph
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'taichi-unifusion[viewer]'")
 
@@ -265,6 +267,17 @@ def test_a_click_says_what_is_there_and_two_clicks_how_far_apart(page):
     assert f"{distance:.3f} m" in page.point.said.content
     page.point.clear()
     assert page.point.last is None and page.stage.marked["measured"] == []
+
+
+def test_a_zero_has_no_sign():
+    mesh = rectangle((-1, -1), (1, 1), -1e-5)
+    scene = Scene(
+        "floor", (SceneMesh("floor", mesh, (Layer("color", np.zeros((4, 3), np.uint8)),)),)
+    )
+    hit = Picker(scene.meshes[0]).pick(np.array([-1e-5, 0.1, 1]), np.array([0.0, 0, -1]))
+    said = dict(describe_hit(scene, hit, []))
+    assert said["position"] == "0.000, 0.100, 0.000 m" and said["height"] == "0.000 m"
+    assert said["normal"] == "0.00, 0.00, 1.00"
 
 
 def test_a_part_is_written_beside_the_results_and_replaces_nothing(viewer, results, tmp_path):
