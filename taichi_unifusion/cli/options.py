@@ -288,7 +288,7 @@ def for_mapping(options: RecordingOptions) -> RecordingOptions:
     given = {american(text.partition("=")[0]) for text in options.option}
     if DETAIL in given or DETAIL not in format_options(options.kind):
         return options
-    return replace(options, option=(*options.option, f"{DETAIL}=0"))
+    return replace(options, format=options.kind, option=(*options.option, f"{DETAIL}=0"))
 
 
 def source_of(options: RecordingOptions, frames: int, color: ColorRecord | None = None) -> Source:
