@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,6 +57,8 @@ class ColorView:
         height, width = values.shape[:2]
         camera = self.camera.resized(width, height)
         if any(self.distortion):
+            import cv2
+
             columns, rows = (
                 np.rint(each).astype(np.int32)
                 for each in cv2.initUndistortRectifyMap(

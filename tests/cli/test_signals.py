@@ -63,7 +63,15 @@ class Slow:
                 raise ImportError("initialization failed") from None
 sys.meta_path.insert(0, Slow())
 """
-AT_THE_END = "import atexit\natexit.register(wait)"
+# among what was registered once the command runs
+AT_THE_END = """
+import atexit
+class Last:
+    def find_spec(self, name, path=None, target=None):
+        if name == "tyro":
+            atexit.register(wait)
+sys.meta_path.insert(0, Last())
+"""
 # Python hears no signals any more when it takes modules apart
 TAKEN_APART = """
 class Last:
