@@ -168,11 +168,8 @@ class Frame:
             raise FrameError(
                 f"{self.label}: features '{name}' must be (h, w, c), got {values.shape}"
             )
-        if view is None:
-            image = ImageView(values, self.camera.resized(values.shape[1], values.shape[0]))
-        else:
-            image = view.image(values)
-        return replace(self, features={**self.features, name: image})
+        view = view or ColorView(self.camera, np.eye(4))
+        return replace(self, features={**self.features, name: view.image(values)})
 
 
 # of a squared normal: half precision and rounding in files stay below it
