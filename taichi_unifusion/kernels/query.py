@@ -4,7 +4,7 @@ IV-B).
 
 import taichi as ti
 
-from .arrays import Bytes1, Floats1, Floats2, Floats3, Ints2, Masks2, row3
+from .arrays import Bytes1, Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, row3
 from .cells import BLOCK_CELLS, CELLS, cell_bit, cell_index, first_cell
 from .index import INDEX_HALF, all_within, find, voxel_of
 
@@ -12,6 +12,7 @@ UNKNOWN = 1e9  # signed distance where no voxel reaches
 CHUNK = 32  # points that one thread sorts by lattice corner
 CHANNELS = 4  # decoded at once
 CODE_BITS = 15  # of an index along an axis
+ITSELF, ABSENT = -1, -2  # in place of a row: the voxel's own field; it takes no part
 NOWHERE, UNCOVERED = -1, -2  # codes of a point: not (or no longer) asked for; of the nearest voxel
 
 
@@ -201,6 +202,8 @@ def corner_support(
     keys: Ints2,  # (Q, 3) lattice corners; the cube of corner q spans the centres of its eight voxels
     index: ti.template(),
     map_masks: Masks2,  # (S, 2) support of each voxel's cells
+    rows: Ints1,  # (S,) row of `own_masks` that counts instead, ITSELF, or ABSENT
+    own_masks: Masks2,  # (E, 2)
     # a cell with at least this many of its 26 neighbours supported is taken in: pinholes close,
     # rims stay
     closing: ti.i32,
@@ -211,13 +214,15 @@ def corner_support(
     for q in range(keys.shape[0]):
         seen = ti.Vector([0] * edge**3)
         for o in range(8):
-            s = corner_slot(keys, q, o, index)
+            s, row = corner_slot(keys, q, o, index), ABSENT
             if s >= 0:
+                row = rows[s]
+            if row != ABSENT:
                 # A voxel's cells 0..3 along an axis are cells -2..1 (upper voxel: 2..5) of the cube
                 # that starts at its centre.
                 base = ti.Vector([o // 4, o // 2 % 2, o % 2]) * CELLS - CELLS // 2 + 1
                 for half in range(2):
-                    mask = map_masks[s, half]
+                    mask = own_masks[row, half] if row >= 0 else map_masks[s, half]
                     while mask != 0:
                         k = first_cell(mask)
                         mask ^= cell_bit(k)
@@ -257,7 +262,8 @@ def sdf_grid(
     keys: Ints2,  # (Q, 3) lattice corners
     index: ti.template(),
     latents: Floats3,  # (S, l, 1)
-    taken: Bytes1,  # (S,) 0: as if the voxel were not there
+    rows: Ints1,  # (S,) row of `own` that counts instead, ITSELF, or ABSENT
+    own: Floats3,  # (E, l, 1)
     basis: Floats2,  # (R^3, 8 l) tent weight times f_posi of each voxel, at the R^3 samples of a cube
     tents: Floats2,  # (R^3, 8)
     # out:
@@ -267,14 +273,13 @@ def sdf_grid(
         F = ti.Vector([0.0] * (8 * rank))
         present = ti.Vector([0.0] * 8)
         for o in range(8):
-            s = corner_slot(keys, q, o, index)
-            wanted = False
+            s, row = corner_slot(keys, q, o, index), ABSENT
             if s >= 0:
-                wanted = taken[s] != 0
-            if wanted:
+                row = rows[s]
+            if row != ABSENT:
                 present[o] = 1.0
                 for a in range(rank):
-                    F[o * rank + a] = latents[s, a, 0]
+                    F[o * rank + a] = own[row, a, 0] if row >= 0 else latents[s, a, 0]
         for r in range(basis.shape[0]):
             value, weight = 0.0, 0.0
             for a in range(8 * rank):

@@ -135,21 +135,23 @@ def find_sides(
     # in:
     rank: ti.template(),
     features: Floats3,  # (65, 4, l) as of `visibility.vote_cells`
-    latents: Floats3,  # (S or more, l, 1)
-    backs: Rows2,  # (S or more, l)
-    side_weights: Floats2,  # (S or more, 2)
+    slots: Ints1,  # (N,) of some voxels
+    latents: Floats3,  # (S, l, 1)
+    backs: Rows2,  # (S, l)
+    side_weights: Floats2,  # (S, 2)
     # out:
-    two: Bytes1,  # (S,) 1 where a voxel has two sides
-    fronts: Floats2,  # (S, l) F, of the front where there are two
-    mean_slopes: Floats2,  # (S, 6) of it, and of that of the back
+    two: Bytes1,  # (N,) 1 where a voxel has two sides
+    fronts: Floats2,  # (N, l) F, of the front where there are two
+    mean_slopes: Floats2,  # (N, 6) of it, and of that of the back
 ):
-    for s in range(two.shape[0]):
+    for n in range(slots.shape[0]):
+        s = slots[n]
         F, B = ti.Vector([0.0] * rank), ti.Vector([0.0] * rank)
         for a in range(rank):
             F[a] = latents[s, a, 0]
-        two[s] = ti.cast(part_sides(rank, s, features, backs, side_weights, F, B), ti.u8)
+        two[n] = ti.cast(part_sides(rank, s, features, backs, side_weights, F, B), ti.u8)
         g, h = mean_slope(F, features, rank), mean_slope(B, features, rank)
         for a in range(rank):
-            fronts[s, a] = F[a]
+            fronts[n, a] = F[a]
         for d in ti.static(range(3)):
-            mean_slopes[s, d], mean_slopes[s, 3 + d] = g[d], h[d]
+            mean_slopes[n, d], mean_slopes[n, 3 + d] = g[d], h[d]

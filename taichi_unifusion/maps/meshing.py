@@ -8,7 +8,7 @@ latents.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING
@@ -17,15 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..geometry.triangles import areas, fill_normals, used_vertices
+from ..geometry.triangles import areas, fill_normals
 from ..kernels import marching_cubes as kernels
 from ..kernels import query
 from ..kernels.cells import CELLS
 from ..kernels.visibility import interpolate_evidence
-from ..runtime import DeviceArray
 from ..types import Mesh
 from .cube_tables import STEPS, marching_cubes_tables
+from .cut_mesh import cut_mesh, without_unused
 from .encoding import PositionEncoding
+from .sheets import REACH
 
 if TYPE_CHECKING:
     from .sheets import Sheet
@@ -38,7 +39,6 @@ MESH_BLOCK = 16  # cubes along a block of the mesh
 BESIDE = 3  # voxels beside blocks that their cubes may have a corner at, and one more
 # a voxel counts in the cubes of its own number and the next; normals change in those beside them
 REACHES = (-1, 2)
-SNAP = 1e-4  # of an edge: a cut this near to a vertex goes through it
 NORMAL_UNIT = float(1 << 18)  # fixed-point one of summed normals, in squared grid spacings
 
 
@@ -50,17 +50,19 @@ def extract_mesh(
     support_closing: int,
     min_evidence: float,
     sheets: Sequence[Sheet],
+    slots: NDArray[np.int32],
     blocks: NDArray[np.int32] | None = None,
 ) -> Mesh:
     """Zero level of the blended field on `resolution`^3 cells a voxel, only where cells are
-    supported; all of it, or what lies in `blocks` (M, 3) of MESH_BLOCK^3 cubes.
+    supported; all of it, or what lies in `blocks` (M, 3) of MESH_BLOCK^3 cubes; `slots` (N,) are those
+    of the voxels near these.
 
     A cell with `support_closing` of its 26 neighbours supported counts as supported. Where the map
     holds evidence, the mesh ends on the line where evidence falls below `min_evidence`.
     """
-    parts, inside = [], []
+    parts, inside, every = [], [], _codes_near(grid, slots, blocks)
     for sheet in sheets:
-        codes, support = _cubes(grid, sheet.masks, support_closing, resolution, blocks)
+        codes, support = _cubes(grid, every, sheet, support_closing, resolution)
         if sheet.near is not None:
             codes, support = _near(codes, support, sheet.near, resolution)
         if not len(codes):
@@ -71,8 +73,9 @@ def extract_mesh(
             encoding.settings.rank,
             keys,
             grid.index,
+            grid["latents"],
+            sheet.rows,
             sheet.latents,
-            sheet.taken,
             *grid_basis(encoding, resolution),
             sdf,
         )
@@ -131,7 +134,7 @@ def welded(
     at = np.searchsorted(kept, first)[number.reshape(-1)].astype(np.int32)
     faces = np.concatenate([at[faces], at[other + len(vertices)]])
     proper = np.flatnonzero((faces != faces[:, [2, 0, 1]]).all(axis=1))
-    return *_without_unused(rows[kept], faces[proper]), proper
+    return *without_unused(rows[kept], faces[proper]), proper
 
 
 def mesh_blocks(keys: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -169,68 +172,6 @@ def _unit(sums: NDArray[np.int32]) -> NDArray[np.float32]:
     return unit
 
 
-def cut_mesh(
-    vertices: NDArray[np.float32], faces: NDArray[np.int32], values: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.intp]]:
-    """The part of a mesh where `values` (V,), linear on every triangle, are not negative, and the
-    face that each of its own comes from; triangles on the border are cut.
-    """
-    inside = values >= 0
-    a, b, c = (inside.view(np.uint8).take(faces[:, k]) for k in range(3))
-    corners = a + b + c  # that stay
-    if (corners == 3).all():
-        return vertices, faces, np.arange(len(faces))
-    crossed = np.flatnonzero((corners > 0) & (corners < 3))
-    one_in = corners[crossed] == 1
-    odd_in = _odd_first(faces[crossed[one_in]], inside)  # the first stays
-    odd_out = _odd_first(faces[crossed[~one_in]], ~inside)  # the first goes
-    first = np.concatenate([odd_in[:, 0], odd_in[:, 0], odd_out[:, 0], odd_out[:, 0]])
-    other = np.concatenate([odd_in[:, 1], odd_in[:, 2], odd_out[:, 1], odd_out[:, 2]])
-    low, high = np.minimum(first, other), np.maximum(first, other)
-    # an edge is cut once, also between two triangles
-    cut, at = np.unique(low * np.int64(len(vertices)) + high, return_inverse=True)
-    a, b = cut // len(vertices), cut % len(vertices)
-    share = values[a] / (values[a] - values[b])
-    on_edges = vertices[a] + share[:, None] * (vertices[b] - vertices[a])
-    number = np.where(
-        share < SNAP, a, np.where(share > 1 - SNAP, b, len(vertices) + np.arange(len(cut)))
-    )
-    i, j, p, q = np.split(
-        number[at.reshape(-1)], np.cumsum([len(odd_in), len(odd_in), len(odd_out)])
-    )
-    pieces = np.concatenate(
-        [
-            np.stack([odd_in[:, 0], i, j], axis=1),
-            np.stack([p, odd_out[:, 1], odd_out[:, 2]], axis=1),
-            np.stack([p, odd_out[:, 2], q], axis=1),
-        ]
-    )
-    # what a cut through a corner makes of a triangle
-    proper = (pieces != pieces[:, [2, 0, 1]]).all(axis=1)
-    whole, out = np.flatnonzero(corners == 3), crossed[~one_in]
-    source = np.concatenate([whole, np.concatenate([crossed[one_in], out, out])[proper]])
-    vertices, faces = _without_unused(
-        np.concatenate([vertices, on_edges]).astype(np.float32, copy=False),
-        np.concatenate([faces.take(whole, axis=0), pieces[proper].astype(np.int32)]),
-    )
-    return vertices, faces, source
-
-
-def _odd_first(faces: NDArray[np.int32], odd: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Faces turned, without changing their orientation, so that their one corner that is `odd`
-    comes first.
-    """
-    first = np.argmax(odd[faces], axis=1)[:, None]
-    return np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
-
-
-def _without_unused(
-    vertices: NDArray[np.float32], faces: NDArray[np.int32]
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    rows, faces = used_vertices(faces)
-    return vertices.take(rows, axis=0), faces
-
-
 def _ranks(chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
     """The number (N,) that each of the chosen (N,) has among them."""
     return np.cumsum(chosen, dtype=np.int32) - 1
@@ -255,45 +196,51 @@ def drop_small_parts(mesh: Mesh, min_area: float) -> Mesh:
 
 def connected_parts(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
     """For each of so many vertices, the first vertex (V,) of the part that its faces connect it to."""
-    return parts_by_pieces(lambda: [faces], vertices)
-
-
-def parts_by_pieces(
-    faces: Callable[[], Iterable[NDArray[np.int32]]], vertices: int
-) -> NDArray[np.int32]:
-    """As `connected_parts`; `faces` gives them (F, 3), some at a time, each time that it is called."""
     part, changed = np.arange(vertices, dtype=np.int32), np.ones(1, np.int32)
     while changed[0]:
         changed[0] = 0
-        for some in faces():
-            kernels.join_parts(some, part, changed)
-            runtime.synchronize()
+        kernels.join_parts(faces, part, changed)
+        runtime.synchronize()
     return part
 
 
-def _cubes(
-    grid: VoxelGrid,
-    masks: DeviceArray,
-    support_closing: int,
-    resolution: int,
-    blocks: NDArray[np.int32] | None = None,
-) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
-    """Sorted codes (Q,) of the cubes that hold surface or close one that does, in or beside
-    `blocks`, and their support masks (Q, 2).
-    """
-    voxels = grid.voxel_keys()
-    if blocks is not None and len(blocks):  # few of many, perhaps
-        low, high = blocks.min(axis=0), blocks.max(axis=0) + 1
-        near = (voxels >= low * MESH_BLOCK - BESIDE) & (voxels <= high * MESH_BLOCK + BESIDE)
-        voxels = np.compress(near.all(axis=1), voxels, axis=0)
-    codes = _with_upper(np.sort(_codes(voxels)))
+def slots_near(grid: VoxelGrid, blocks: NDArray[np.int32] | None) -> NDArray[np.int32]:
+    """Slots (N,) of the voxels that the mesh in `blocks` may depend on, or all, and of more."""
+    slots = grid.used_slots()
+    if blocks is None or not len(blocks):
+        return slots
+    keys, reach = grid.rows("keys", slots), BESIDE + REACH
+    low, high = blocks.min(axis=0) * MESH_BLOCK, (blocks.max(axis=0) + 1) * MESH_BLOCK
+    near = ((keys >= low - reach) & (keys <= high + reach)).all(axis=1)
+    return np.compress(near, slots)
+
+
+def _codes_near(
+    grid: VoxelGrid, slots: NDArray[np.int32], blocks: NDArray[np.int32] | None
+) -> NDArray[np.int64]:
+    """Sorted codes of the cubes that have a corner at a voxel of `slots`, in or beside `blocks`."""
+    codes = _with_upper(np.sort(_codes(grid.rows("keys", slots))))
     if blocks is not None:
         keys = _keys(codes)
         beside = [_lie_in(keys + step, blocks) for step in product((-1, 1), repeat=3)]
         codes = np.compress(np.any(beside, axis=0), codes)
+    return codes
+
+
+def _cubes(
+    grid: VoxelGrid,
+    codes: NDArray[np.int64],
+    sheet: Sheet,
+    support_closing: int,
+    resolution: int,
+) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
+    """Sorted codes (Q,) of those cubes among some that hold surface of a sheet, and of cubes that close
+    one that does, and their support masks (Q, 2).
+    """
     support = np.empty((len(codes), 2), np.uint32)
     if len(codes):
-        query.corner_support(_keys(codes), grid.index, masks, support_closing, support)
+        masks = grid["masks"], sheet.rows, sheet.masks
+        query.corner_support(_keys(codes), grid.index, *masks, support_closing, support)
     with_surface = (support[:, 0] | support[:, 1]) != 0
     codes, support = np.compress(with_surface, codes), np.compress(with_surface, support, axis=0)
     return _closed(codes, support, resolution)

@@ -24,7 +24,7 @@ from .distance import distances
 from .encoder import check_points, to_device
 from .keywords import SurfaceKeywords, settings_of, shows_keywords
 from .local_lim import LocalLim
-from .meshing import blocks_in, drop_small_parts, extract_mesh
+from .meshing import blocks_in, drop_small_parts, extract_mesh, slots_near
 from .regression_map import RegressionMap
 from .settings import MAX_RESOLUTION, SurfaceSettings
 from .sheets import FRONT, Sheet, sheets_of, whole
@@ -152,10 +152,10 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         """Whether opposite sides are kept apart."""
         return "side_weights" in self.grid
 
-    def _sheets(self) -> Sequence[Sheet]:
+    def _sheets(self, slots: NDArray[np.int32]) -> Sequence[Sheet]:
         if not self.two_sides:
             return (whole(self.grid),)
-        return sheets_of(self.grid, self._cell_features)
+        return sheets_of(self.grid, self._cell_features, slots)
 
     @cached_property
     def cell_gradients(self) -> DeviceArray:
@@ -237,6 +237,7 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
         box = None if bounds is None else box_of(bounds)
         if box is not None and blocks is None:
             blocks = blocks_in(self.grid.voxel_keys(), box / self.voxel_size)
+        slots = slots_near(self.grid, blocks)
         mesh = extract_mesh(
             self.grid,
             self.encoder.tables.encoding,
@@ -244,7 +245,8 @@ class SurfaceMap(RegressionMap[SurfaceSettings]):
             resolution,
             self.settings.support_closing,
             self.settings.min_evidence,
-            self._sheets(),
+            self._sheets(slots),
+            slots,
             blocks,
         )
         if box is not None:

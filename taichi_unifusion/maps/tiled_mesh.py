@@ -4,7 +4,7 @@ maps, vertex for vertex.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.triangles import areas
 from ..types import Mesh
-from .meshing import MESH_BLOCK, drop_small_parts, parts_by_pieces
+from .meshing import MESH_BLOCK, connected_parts, drop_small_parts
 from .property_map import PropertyMap
 from .surface_map import SurfaceMap
 from .tile_places import TILE, code_of, tile_of, tiles_around
@@ -92,17 +92,13 @@ def on_border(vertices: NDArray[np.float32], voxel_size: float) -> NDArray[np.bo
     return np.any(np.abs(places - np.rint(places)) < 1e-5, axis=1)
 
 
-def parts_of_area(
-    vertices: NDArray[np.float32], faces: Callable[[], Iterable[NDArray[np.int32]]], least: float
-) -> NDArray[np.bool_]:
-    """Which vertices (V, 3) [m] belong to connected parts of at least so many square metres; `faces`
-    gives the triangles (F, 3) of the mesh, some at a time, each time that it is called.
-    """
-    part = parts_by_pieces(faces, len(vertices))
-    area = np.zeros(len(vertices))
-    for some in faces():
-        area += np.bincount(part[some[:, 0]], areas(vertices, some), len(vertices))
-    return area[part] >= least
+def parts_with_areas(mesh: Mesh) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """The connected part (V,) that each vertex of a piece belongs to, and the areas (P,) of these [m^2]."""
+    first = connected_parts(mesh.faces, len(mesh.vertices))
+    _, part = np.unique(first, return_inverse=True)
+    part = part.reshape(-1).astype(np.int32)
+    area = np.bincount(part[mesh.faces[:, 0]], areas(mesh.vertices, mesh.faces))
+    return part, np.asarray(area, np.float64)
 
 
 def joined_mesh(

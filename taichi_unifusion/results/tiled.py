@@ -13,7 +13,7 @@ from ..config import MeshSettings
 from ..files.mesh_stream import MeshStream
 from ..files.tiles import INDEX, TileFolder
 from ..maps.stored import describe_tiles
-from ..maps.tiled_mesh import mesh_pieces, on_border, parts_of_area
+from ..maps.tiled_mesh import mesh_pieces, on_border, parts_with_areas
 from ..maps.working_set import MapMemory
 from .folder_writer import FolderWriter
 from .record import MeshRecord
@@ -74,8 +74,6 @@ def stream_mesh(path: Path, memory: MapMemory, settings: MeshSettings) -> MeshRe
     voxel_size = memory.sets["surface"].map.voxel_size
     with MeshStream(path) as stream:
         for slab, mesh in mesh_pieces(memory, settings.resolution, settings.bounds):
-            stream.add(mesh, on_border(mesh.vertices, voxel_size), slab)
-        kept = None
-        if settings.min_area > 0 and stream.triangles:
-            kept = parts_of_area(stream.places, stream.faces, settings.min_area)
-        return MeshRecord(*stream.write(kept))
+            border = on_border(mesh.vertices, voxel_size)
+            stream.add(mesh, border, slab, *parts_with_areas(mesh))
+        return MeshRecord(*stream.write(settings.min_area))

@@ -4,6 +4,8 @@ made-up latents.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import reference
@@ -165,14 +167,35 @@ def test_a_constant_is_decoded_at_voxel_centres_of_neighbours_too():
     np.testing.assert_allclose(values[valid], 0.75, atol=1e-3)
 
 
+def other_rows(target, voxels):
+    """Rows (S,) as kernels take them, the voxels that take no part, and the row of those that have one."""
+    rows, keys = np.full(target.grid.count, kernels.ITSELF, np.int32), list(voxels)
+    left_out = keys[:: len(keys) // 9]
+    other = dict.fromkeys(keys[1 :: len(keys) // 9], 0) | dict.fromkeys(
+        keys[2 :: len(keys) // 9], 1
+    )
+    rows[target.grid.slots_of(np.array(left_out, np.int32))] = kernels.ABSENT
+    rows[target.grid.slots_of(np.array(list(other), np.int32))] = list(other.values())
+    return rows, left_out, other
+
+
 def test_corner_support_equals_its_twin(surface):
     target, voxels = surface
     corners = np.unique((np.array(list(voxels))[:, None] + STEPS).reshape(-1, 3), axis=0).astype(
         np.int32
     )
+    rows, left_out, other = other_rows(target, voxels)
+    masks = np.array([[0, 1 << 31], [2**32 - 1, 0]], np.uint32)
+    cells = reference.unpack_masks(masks).reshape(2, *[4] * 3)
+    voxels = {
+        key: replace(voxel, mask=cells[other[key]]) if key in other else voxel
+        for key, voxel in voxels.items()
+        if key not in left_out
+    }
     for closing in (1, 9, 27):
         support = np.empty((len(corners), 2), np.uint32)
-        kernels.corner_support(corners, target.grid.index, target.grid["masks"], closing, support)
+        index, own = target.grid.index, target.grid["masks"]
+        kernels.corner_support(corners, index, own, rows, masks, closing, support)
         twin = [reference.corner_support(voxels, corner, closing).reshape(-1) for corner in corners]
         np.testing.assert_array_equal(reference.unpack_masks(support), twin)
         assert 0.02 < np.mean(twin) < 0.9
@@ -186,12 +209,15 @@ def test_sdf_grid_equals_its_twin(surface, resolution):
     )
     sdf = np.empty((len(corners), resolution**3), np.float32)
     basis = grid_basis(target.encoder.tables.encoding, resolution)
-    taken = np.ones(target.grid.count, np.uint8)
-    left_out = list(voxels)[:: len(voxels) // 9]
-    taken[target.grid.slots_of(np.array(left_out, np.int32))] = 0
+    rows, left_out, other = other_rows(target, voxels)
+    F = np.random.default_rng(3).normal(size=(2, 6, 1)).astype(np.float32)
     latents, index = target.grid["latents"], target.grid.index
-    kernels.sdf_grid(6, corners, index, latents, taken, *basis, sdf)
-    voxels = {key: voxel for key, voxel in voxels.items() if key not in left_out}
+    kernels.sdf_grid(6, corners, index, latents, rows, F, *basis, sdf)
+    voxels = {
+        key: replace(voxel, F=F[other[key]]) if key in other else voxel
+        for key, voxel in voxels.items()
+        if key not in left_out
+    }
     unknown = 0
     for corner, samples in zip(corners, sdf, strict=True):
         twin = reference.sdf_grid(ENCODER, voxels, corner, resolution).reshape(-1)

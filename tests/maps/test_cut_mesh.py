@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mesh_laws import assert_welded
 
-from taichi_unifusion.maps.meshing import cut_mesh
+from taichi_unifusion.maps.cut_mesh import cut_mesh
 
 AREA = 1e-4  # relative: cuts go through vertices that are this near, in edges
 

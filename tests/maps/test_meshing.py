@@ -15,6 +15,7 @@ from taichi_unifusion.kernels import marching_cubes as kernels
 from taichi_unifusion.maps import SurfaceMap, meshing
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.meshing import drop_small_parts, welded
+from taichi_unifusion.maps.sheets import whole
 from taichi_unifusion.maps.voxel_data import VoxelData
 from taichi_unifusion.types import Mesh
 
@@ -287,28 +288,31 @@ def test_cubes_left_out_have_no_part_in_the_mesh(resolution):
         },
     )
     target.grid.add(voxels)
-    meshes = []
+    meshes, sheet = [], whole(target.grid)
+    every = meshing._codes_near(target.grid, target.grid.used_slots(), None)
     for codes, support in (
-        meshing._cubes(target.grid, target.grid["masks"], 14, resolution),
+        meshing._cubes(target.grid, every, sheet, 14, resolution),
         all_cubes(target.grid, 14),
     ):
         keys, upper = meshing._keys(codes), meshing._upper_cubes(codes)
         sdf = np.empty((len(keys), resolution**3), np.float32)
         basis = meshing.grid_basis(target.encoder.tables.encoding, resolution)
-        grid, taken = target.grid, np.ones(target.grid.count, np.uint8)
-        meshing.query.sdf_grid(6, keys, grid.index, grid["latents"], taken, *basis, sdf)
+        fields = target.grid["latents"], sheet.rows, sheet.latents
+        meshing.query.sdf_grid(6, keys, target.grid.index, *fields, *basis, sdf)
         meshes.append((len(keys), meshing._march(keys, upper, support, sdf, resolution, VS)))
-    (few, mesh), (many, whole) = meshes
+    (few, mesh), (many, complete) = meshes
     assert few < many and len(mesh[1]) > 20
-    np.testing.assert_array_equal(mesh[0], whole[0])
-    np.testing.assert_array_equal(mesh[1], whole[1])
+    np.testing.assert_array_equal(mesh[0], complete[0])
+    np.testing.assert_array_equal(mesh[1], complete[1])
 
 
 def all_cubes(grid, closing: int):
     """Codes (Q,) and support (Q, 2) of all cubes around a grid's voxels, and of one more beyond."""
     codes = meshing._with_upper(meshing._with_upper(np.sort(meshing._codes(grid.voxel_keys()))))
     support = np.empty((len(codes), 2), np.uint32)
-    meshing.query.corner_support(meshing._keys(codes), grid.index, grid["masks"], closing, support)
+    sheet = whole(grid)
+    masks = grid["masks"], sheet.rows, sheet.masks
+    meshing.query.corner_support(meshing._keys(codes), grid.index, *masks, closing, support)
     return codes, support
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mesh_laws import assert_welded
+from mesh_laws import assert_welded, triangles
 from places import DEVICE
 
 import taichi_unifusion as uf
 from taichi_unifusion.datasets.synthetic import Scene, SyntheticRoom, look_at
 from taichi_unifusion.maps import SurfaceMap, load_map
+from taichi_unifusion.maps.meshing import mesh_blocks
 from taichi_unifusion.rendering.primitives import box
 from taichi_unifusion.rendering.raycaster import RayCaster
 from taichi_unifusion.rendering.room import furnished_room
@@ -73,6 +74,23 @@ def test_F_both_faces_of_a_board_are_where_they_are(board_map, thickness):
     np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-4)
 
 
+def test_blocks_with_a_board_together_are_the_whole_mesh(board_map):
+    """Also where a border of blocks goes through the board: what lies beyond counts."""
+    surface = board_map(0.02)
+    mesh, blocks = surface.extract_mesh(2), mesh_blocks(surface.grid.voxel_keys())
+    alone = [surface.extract_mesh(2, blocks=block[None]) for block in blocks]
+    on_board = [each for each in alone if len(each.part(lies_on_board(each))[0].faces)]
+    assert len(on_board) >= 4
+    rows = np.concatenate([triangles(each) for each in alone])
+    np.testing.assert_array_equal(rows[np.lexsort(rows.T[::-1])], triangles(mesh))
+
+
+def lies_on_board(mesh: Mesh) -> np.ndarray:
+    """Which faces (F,) lie within the board's outline."""
+    x, y, z = mesh.vertices[mesh.faces[:, 0]].T
+    return (np.abs(x) < 0.5) & (np.abs(y) < 0.05) & (np.abs(z - 1) < 0.5)
+
+
 def test_one_field_a_voxel_cannot_hold_both(board_map):
     assert max(within(board_map(0.02, two_sides=False).extract_mesh(4), 0.02)) < 0.3
 
@@ -101,4 +119,5 @@ def test_a_room_has_one_sheet(board_map):
     for frame in SyntheticRoom(frames=8, width=160, height=120):
         pipeline.step(frame)
     pipeline.surface.flush()
-    assert [sheet.near for sheet in pipeline.surface._sheets()] == [None]
+    sheets = pipeline.surface._sheets(pipeline.surface.grid.used_slots())
+    assert [sheet.near for sheet in sheets] == [None]

@@ -83,6 +83,9 @@ def test_a_run_without_tiles_takes_those_of_an_earlier_one_away(tmp_path):
     assert all(path.is_dir() for path in RunFolder(tmp_path).maps.values())
 
 
+ONE_PART = np.zeros(4, np.int32), np.ones(1)  # of a strip, and its area
+
+
 def strip(first: float) -> Mesh:
     """Two triangles between x = first and first + 1."""
     x = np.array([first, first, first + 1, first + 1], np.float32)
@@ -94,7 +97,7 @@ def strip(first: float) -> Mesh:
 def test_pieces_are_welded_where_they_meet(tmp_path):
     with MeshStream(tmp_path / "mesh.ply") as stream:
         for slab in range(5):
-            stream.add(strip(slab), np.ones(4, bool), slab)
+            stream.add(strip(slab), np.ones(4, bool), slab, *ONE_PART)
         assert (stream.vertices, stream.triangles) == (12, 10)
         assert stream.write() == (12, 10)
     mesh = read_mesh(tmp_path / "mesh.ply")
@@ -110,9 +113,32 @@ def test_pieces_are_welded_where_they_meet(tmp_path):
 def test_parts_can_be_left_out(tmp_path):
     with MeshStream(tmp_path / "mesh.ply") as stream:
         for slab in (0, 1, 4):
-            stream.add(strip(slab), np.ones(4, bool), slab)
-        assert stream.write(stream.places[:, 0] < 3) == (6, 4)
+            stream.add(strip(slab), np.ones(4, bool), slab, *ONE_PART)
+        assert stream.write(1.5) == (6, 4)
     assert read_mesh(tmp_path / "mesh.ply").vertices[:, 0].max() == 2
+
+
+def test_parts_that_a_later_piece_connects_are_one(tmp_path):
+    """Two strips of one piece, each too small, that the next piece joins, and one that stays alone."""
+    apart, far = strip(0), strip(20)
+    other = replace(apart, vertices=apart.vertices + np.float32([0, 1.5, 0]))
+    several = [apart, other, far]
+    piece = Mesh(
+        np.concatenate([each.vertices for each in several]),
+        np.concatenate([each.faces + 4 * n for n, each in enumerate(several)]),
+    )
+    bridge = Mesh(
+        np.array([[1, 1, 0], [1, 1.5, 0], [2, 1, 0]], np.float32),
+        np.array([[0, 2, 1]], np.int32),
+    )
+    with MeshStream(tmp_path / "mesh.ply") as stream:
+        part = np.repeat(np.arange(3, dtype=np.int32), 4)
+        stream.add(piece, np.ones(12, bool), 0, part, np.ones(3))
+        stream.add(bridge, np.ones(3, bool), 0, np.zeros(3, np.int32), np.full(1, 0.25))
+        assert stream.write(2.0) == (9, 5)
+    mesh = read_mesh(tmp_path / "mesh.ply")
+    assert mesh.vertices[:, 0].max() == 2 and mesh.vertices[:, 1].max() == 2.5
+    assert_welded(mesh.vertices, mesh.faces)
 
 
 def test_without_pieces_the_mesh_is_empty(tmp_path):
