@@ -182,6 +182,28 @@ def assign_slots(
 
 
 @ti.kernel
+def clear_index(
+    # in and out:
+    index: ti.template(),  # no voxel has a slot, or was touched; leaves stay
+):
+    for ijk in ti.grouped(index.slot):
+        index.slot[ijk] = 0
+        index.stamp[ijk] = 0
+        index.block[ijk] = 0
+
+
+@ti.kernel
+def remove_slots(
+    # in:
+    keys: Ints2,  # (N, 3) voxels that have a slot
+    # in and out:
+    index: ti.template(),  # they have none
+):
+    for n in range(keys.shape[0]):
+        index.slot[row3(keys, n) + INDEX_HALF] = 0
+
+
+@ti.kernel
 def find_slots(
     # in:
     blocks: ti.i32,

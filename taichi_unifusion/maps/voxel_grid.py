@@ -287,14 +287,21 @@ class VoxelGrid:
         runtime.check_alive(self.runtime)
         self.recount()
         self._inherited = max(self._inherited, self._leaves)
+        crowded = _is_crowded(self.runtime, self._leaves)
+        if not crowded:  # a few voxels of a tree that keeps all its nodes: quicker than emptying it
+            gone = self.rows(KEYS.name, np.setdiff1d(self.used_slots(), slots, assume_unique=True))
+            if len(gone):
+                kernels.remove_slots(gone, self.index)
         for pool in self._pools.values():
             pool.move_down(slots, self.count)
-        _clear_tree(self.runtime, self.index, self._leaves)
+        if crowded:
+            _clear_tree(self.runtime, self.index, self._leaves)
         self.count, self.empty, self.packed = len(slots), 0, self.packed + 1
         if len(slots):
             kept = self._pools[KEYS.name].take(np.arange(len(slots), dtype=np.int32))
             kernels.assign_slots(kept, 0, self.index)
-        self.recount()
+        if crowded:
+            self.recount()
 
     @property
     def row_bytes(self) -> int:
@@ -357,15 +364,18 @@ def _clear_tree(live: runtime.Runtime, tree: kernels.Index, leaves: int) -> int:
     while other maps live have crashed processes. They are given back, on the CPU (taichi#6401), only
     where there are many, or where the tree has more than half of its share of what is safe.
     """
-    tree.slot.fill(0)
-    tree.stamp.fill(0)
-    tree.block.fill(0)
-    share = (SPARSE_POOL - live.trees * BYTES_PER_TREE) / live.trees
-    if live.device != "cpu" or leaves * BYTES_PER_LEAF <= min(CROWDED, share / 2):
+    kernels.clear_index(tree)
+    if not _is_crowded(live, leaves):
         return leaves
     topmost: Any = tree.leaf_parent.parent(2)  # pointer node
     topmost.deactivate_all()
     return 0
+
+
+def _is_crowded(live: runtime.Runtime, leaves: int) -> bool:
+    """Whether an index tree of so many leaves gives its nodes back when it is emptied."""
+    share = (SPARSE_POOL - live.trees * BYTES_PER_TREE) / live.trees
+    return live.device == "cpu" and leaves * BYTES_PER_LEAF > min(CROWDED, share / 2)
 
 
 def _build_tree() -> kernels.Index:

@@ -50,9 +50,12 @@ class WorkingSet:
     def codes(self, points: NDArray, halo: int = HALO) -> set[int]:
         """The tiles around points (N, 3) world [m], by code."""
         voxels = points / self.map.voxel_size
-        reach = np.array(np.meshgrid(*[[-halo, halo]] * 3)).reshape(3, -1).T
-        around = np.concatenate([place_codes(voxels + step) for step in reach])
-        return set(np.unique(around).tolist())
+        low, high = place_codes(voxels - halo), place_codes(voxels + halo)
+        # most points lie within one tile
+        found, some = set(np.unique(low).tolist()), voxels[low != high]
+        for step in np.array(np.meshgrid(*[[-halo, halo]] * 3)).reshape(3, -1).T:
+            found |= set(np.unique(place_codes(some + step)).tolist())
+        return found
 
     def bring(self, codes: Iterable[int]) -> None:
         """Load the tiles among `codes` that only the folder has; raises FileError, MapCorrupt or

@@ -117,6 +117,54 @@ def test_find_release_and_row_copies_equal_a_dict():
     np.testing.assert_array_equal(data.sums, sums[order])
 
 
+@pytest.mark.parametrize("crowded", [False, True])
+def test_voxels_that_are_kept_follow_each_other_and_others_are_gone(monkeypatch, crowded):
+    """Whether the index is emptied, or only the others are taken out of it; both can come again."""
+    gc.collect()
+    monkeypatch.setattr(voxel_grid, "CROWDED", 0 if crowded else 1 << 40)
+    grid, rng = a_grid(), np.random.default_rng(8)
+    keys = np.unique(rng.integers(-9, 9, (500, 3)), axis=0).astype(np.int32)
+    ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
+    grid.claim(len(keys), keys, ones, slots)
+    grid["weights"].from_numpy(np.arange(1, grid.capacity + 1, dtype=np.float32))
+    kept = np.sort(rng.permutation(len(keys))[:200]).astype(np.int32)
+    at = np.argsort(slots)[kept]  # the keys of these slots
+    grid.retain(kept)
+    wanted = np.full(len(keys), -1)
+    wanted[at] = np.arange(200)
+    np.testing.assert_array_equal(grid.slots_of(keys), wanted)
+    np.testing.assert_array_equal(grid["weights"].to_numpy()[:200], kept + 1.0)
+    assert len(grid) == 200 and not grid["weights"].to_numpy()[200 : len(keys)].any()
+    points = ((keys + 0.5) * VS).astype(np.float32)
+    assert len(touch(grid, points)) == len(keys)
+    assert grid.claim(len(keys), keys, ones, slots) == grid.count == len(keys)
+
+
+def test_clear_index_leaves_no_voxel(cloud):
+    """Neither with a slot nor touched, whatever the stamp, and the leaves are there."""
+    gc.collect()
+    grid = a_grid()
+    keys = touch(grid, cloud.points)
+    kernels.assign_slots(keys, 0, grid.index)
+    leaves, frame = kernels.count_leaves(grid.index), grid.frame
+    kernels.clear_index(grid.index)
+    assert (grid.slots_of(keys) == -1).all() and kernels.count_leaves(grid.index) == leaves > 0
+    grid.frame = frame - 1  # the same stamp again
+    assert set(map(tuple, touch(grid, cloud.points).tolist())) == set(map(tuple, keys.tolist()))
+
+
+def test_remove_slots_equals_a_dict():
+    grid, kept = a_grid(), {}
+    keys = np.array([[0, 0, 0], [3, -3, 3], [4, 0, 0], [-1, 0, 8]], np.int32)
+    for slot, key in enumerate(keys.tolist()):
+        kept[tuple(key)] = slot
+    kernels.assign_slots(keys, 0, grid.index)
+    kernels.remove_slots(keys[1:3], grid.index)
+    for key in keys[1:3].tolist():
+        del kept[tuple(key)]
+    assert grid.slots_of(keys).tolist() == [kept.get(tuple(key), -1) for key in keys.tolist()]
+
+
 def test_count_leaves_counts_4x4x4_groups_of_voxels(monkeypatch):
     gc.collect()
     monkeypatch.setattr(voxel_grid, "CROWDED", 0)  # a tree that was used before gives nodes back
@@ -157,7 +205,7 @@ def test_more_live_maps_than_taichi_bears_are_refused(monkeypatch):
 def test_a_map_that_only_a_cycle_holds_makes_room(monkeypatch):
     gc.collect()
     live = runtime.current()
-    held = [a_grid() for _ in range(max(len(live.free_trees), 1))]
+    held = [a_grid() for _ in range(max(len(live.free_trees), voxel_grid.MAPS_OF_A_RUN))]
     monkeypatch.setattr(runtime, "MAX_TREES", live.trees)
     held[0].itself = held[0]  # as the traceback of an error holds what its frames name
     del held[0]
