@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
+import sys
 import time
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir, mkdtemp
 
+LOCK, LIST = "ticache.lock", "ticache.tcb"  # Taichi's names
 STALE_LOCK = 60  # [s] Taichi locks its cache for a second or two
 
 logger = logging.getLogger(__name__)
@@ -22,7 +25,7 @@ def open_kernel_cache(folder: str) -> str:
     again, is removed; one from the future too, for the clock may have been set back.
     """
     if _can_be_used(Path(folder)):
-        lock = Path(folder) / "ticache.lock"
+        lock = Path(folder) / LOCK
         with suppress(OSError):
             if abs(time.time() - lock.stat().st_mtime) > STALE_LOCK:
                 lock.unlink()
@@ -56,3 +59,34 @@ def _folder_of_mine() -> Path:
         if found.st_uid == os.getuid() and found.st_mode == 0o40700 and _can_be_used(folder):
             return folder
     return Path(mkdtemp(prefix="taichi-kernels-"))
+
+
+def seed_kernel_cache(folder: Path) -> None:
+    """Give a folder that is not there yet, or empty, the kernels of the fullest one beside it, or of
+    this user's other processes, so that a new worker need not compile what others have.
+    """
+    if any(folder.glob("*")):
+        return
+    shared = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi/ticache"
+    sources = [each for each in (*folder.parent.glob("*"), shared) if (each / LIST).is_file()]
+    fullest = max(sources, key=lambda each: len(list(each.glob("*.tic"))), default=None)
+    if fullest is None:
+        return
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    copy = Path(mkdtemp(prefix=".new-", dir=folder.parent))
+    try:
+        # the list first: what it names is written before it
+        for file in (fullest / LIST, *fullest.glob("*.tic")):
+            shutil.copy2(file, copy)
+        os.replace(copy, folder)
+    except OSError:  # a file has just gone, or somebody else was quicker
+        shutil.rmtree(copy, ignore_errors=True)
+
+
+def write_kernels() -> None:
+    """Let Taichi write the kernels that this process has compiled, and end: it does so by itself only
+    where a process has time to end.
+    """
+    taichi = sys.modules.get("taichi")
+    if taichi is not None:
+        taichi.reset()

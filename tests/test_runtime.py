@@ -13,7 +13,7 @@ from places import DEVICE
 
 from taichi_unifusion import runtime
 from taichi_unifusion.errors import InputError
-from taichi_unifusion.kernel_cache import open_kernel_cache
+from taichi_unifusion.kernel_cache import open_kernel_cache, seed_kernel_cache
 
 GETFRAMEINFO = inspect.getframeinfo
 
@@ -92,6 +92,33 @@ def test_another_taichi_that_is_not_there_is_named(tmp_path):
 def test_a_cache_that_is_not_there_is_made(tmp_path, caplog):
     assert open_kernel_cache(str(tmp_path / "of" / "kernels")) == str(tmp_path / "of" / "kernels")
     assert (tmp_path / "of" / "kernels").is_dir() and not caplog.text
+
+
+def test_a_new_worker_has_the_kernels_of_the_one_with_most(tmp_path, monkeypatch):
+    """What it has itself stays as it is, and folders without a list are none."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    workers = tmp_path / "taichi_unifusion"
+    seed_kernel_cache(workers / "worker-0")
+    assert not workers.exists()  # nobody has any
+    for name, kernels in (("taichi/ticache", 2), ("taichi_unifusion/worker-1", 3)):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "ticache.tcb").write_text(name)
+        for n in range(kernels):
+            (tmp_path / name / f"T{n}.tic").write_text(name)
+    (workers / "broken").mkdir()
+    for n in range(9):
+        (workers / "broken" / f"T{n}.tic").touch()
+    seed_kernel_cache(workers / "worker-0")
+    assert sorted(file.name for file in (workers / "worker-0").iterdir()) == [
+        "T0.tic",
+        "T1.tic",
+        "T2.tic",
+        "ticache.tcb",
+    ]
+    (workers / "worker-0" / "T0.tic").write_text("own")
+    seed_kernel_cache(workers / "worker-0")
+    assert (workers / "worker-0" / "T0.tic").read_text() == "own"
+    assert {each.name for each in workers.iterdir()} == {"broken", "worker-0", "worker-1"}
 
 
 def test_a_cache_that_cannot_be_written_is_not_used_and_that_is_said(tmp_path):

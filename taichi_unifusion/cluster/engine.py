@@ -7,13 +7,14 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import InputError, MissingDependency, UniFusionError
 from ..files.strict_yaml import read_yaml
+from ..kernel_cache import seed_kernel_cache, write_kernels
 
 logger = logging.getLogger(__name__)
 
@@ -165,7 +166,9 @@ def own_kernels() -> dict[str, str]:
         return {}
     name = "".join(letter if letter.isalnum() else "-" for letter in worker)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return {KERNELS: str(cache / "taichi_unifusion" / f"worker-{name}")}
+    folder = cache / "taichi_unifusion" / f"worker-{name}"
+    seed_kernel_cache(folder)
+    return {KERNELS: str(folder)}
 
 
 @contextmanager
@@ -196,6 +199,9 @@ def open_engine(settings: ClusterSettings) -> Iterator[Engine]:
             ) from None
         client.forward_logging("taichi_unifusion", level=logging.WARNING)
         yield Engine(client, local)
+        if address != settings.cluster:  # these workers end now, and sooner than Taichi would write
+            with suppress(Exception):
+                client.run(write_kernels, on_error="ignore")
 
 
 def _local(distributed: Any, workers: int) -> Any:

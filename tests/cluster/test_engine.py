@@ -9,10 +9,15 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from taichi_unifusion.cluster.engine import ClusterSettings, open_engine
+from taichi_unifusion.cluster import work
+from taichi_unifusion.cluster.engine import KERNELS, ClusterSettings, open_engine
+from taichi_unifusion.config import Config
 from taichi_unifusion.errors import FileError, InputError, UniFusionError
+from taichi_unifusion.maps.pool import Pool
+from taichi_unifusion.maps.voxel_data import VoxelField
 
 pytest.importorskip("distributed", reason="needs Dask: pip install 'taichi-unifusion[cluster]'")
 
@@ -37,6 +42,23 @@ def test_work_is_done_elsewhere_and_again_where_a_worker_is_lost(tmp_path):
     assert [each[0] for each in found[:3]] == [2, 4, 6]
     assert isinstance(found[3], FileError) and "4.png" in str(found[3])
     assert os.getpid() not in {each[1] for each in found[:3]} and len(done) == 4
+
+
+def compiled(count: int) -> str:
+    """Where this worker keeps its kernels, of which it has compiled one."""
+    work.start(Config(device="cpu", threads=1))
+    Pool(VoxelField("rows", np.dtype(np.float32), (1,)), count).take(np.zeros(1, np.int32))
+    return os.environ[KERNELS]
+
+
+def test_kernels_are_on_disk_when_a_worker_of_this_machine_has_ended(tmp_path, monkeypatch):
+    """It is ended before Taichi would write them, so that each start would compile all again."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(KERNELS, raising=False)
+    with open_engine(ClusterSettings(workers=1)) as engine:
+        (folder,) = engine.map(compiled, [(4,)])
+    assert folder == str(tmp_path / "taichi_unifusion" / "worker-0")
+    assert list(Path(folder).glob("*.tic"))
 
 
 def test_workers_that_are_given_up_are_started_again(tmp_path, monkeypatch):
