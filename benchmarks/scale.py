@@ -1,9 +1,11 @@
 """A map larger than memory: a building of many flats, which is the same flat laid out beside itself.
 
-    python benchmarks/scale.py PATH/aws-small-house [--rows 12 --columns 10 --every 10]
+    python benchmarks/scale.py PATH/aws-small-house [--rows 12 --columns 10 --every 10] [--out FOLDER]
+    python benchmarks/scale.py PATH/aws-small-house --out FOLDER --only-mesh
 
 Its poses are the true ones, and it is mapped within --map-memory. Prints a row for every ten flats: how
-long a frame takes, what is in memory and on disk; in the end what Open3D's grid would need.
+long a frame takes, what is in memory and on disk; in the end what Open3D's grid would need. Then the
+mesh is made, piece by piece, and looked through for vertices that lie twice at one place.
 """
 
 from __future__ import annotations
@@ -19,10 +21,15 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_unifusion.config import Config
+from taichi_unifusion.files.ply import FACE_ROW
 from taichi_unifusion.files.tiles import TileFolder
 from taichi_unifusion.maps.stored import read_tile
+from taichi_unifusion.maps.tiled_mesh import on_border
+from taichi_unifusion.maps.working_set import MapMemory
+from taichi_unifusion.results.tiled import open_memory, stream_mesh
 from taichi_unifusion.types import Frame, PinholeCamera
 
 PITCH = np.array([22.0, 14.0])  # [m] from one flat to the next, which is 19 x 11 m
@@ -30,6 +37,10 @@ PITCH = np.array([22.0, 14.0])  # [m] from one flat to the next, which is 19 x 1
 # and 16-bit numbers: attributes tsdf f32, weight u16, color 3 u16
 OPEN3D_BYTES_A_VOXEL, OPEN3D_VOXEL, BLOCK = 4 + 2 + 3 * 2, 0.01, 16
 FIRST_FLATS = 4  # that the time of a frame is compared with
+VERTEX_ROW = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [("rgb", "u1", 3)]
+)
+ROWS = 1 << 20  # of a mesh that are read at once
 
 
 def main() -> None:
@@ -42,8 +53,18 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=10)
     parser.add_argument("--map-memory", default="1GB")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--resolution", type=int, default=4, help="cells a voxel of the mesh")
     parser.add_argument("--no-mesh", action="store_true")
-    run_building(parser.parse_args())
+    parser.add_argument("--only-mesh", action="store_true", help="of the maps that are in --out")
+    options = parser.parse_args()
+    if not options.only_mesh:
+        run_building(options)
+    elif options.out is None:
+        parser.error("--only-mesh needs --out")
+    else:
+        memory = open_memory({name: options.out / "maps" / name for name in ("surface", "color")})
+        assert memory is not None
+        mesh_building(options.out, options.resolution, memory)
 
 
 def render_flat(path: Path, every: int, folder: Path) -> None:
@@ -85,7 +106,6 @@ def building_frames(options: argparse.Namespace) -> Iterator[tuple[int, Frame]]:
 def run_building(options: argparse.Namespace) -> None:
     """Map the building, and print a row for every ten flats."""
     from taichi_unifusion.pipeline import Pipeline
-    from taichi_unifusion.results.tiled import stream_mesh
 
     out = options.out or Path(tempfile.mkdtemp(prefix="building"))
     config = replace(Config(voxel_size=0.05), map_memory=options.map_memory)
@@ -119,14 +139,64 @@ def run_building(options: argparse.Namespace) -> None:
         f"{OPEN3D_BYTES_A_VOXEL} bytes a voxel"
     )
     if not options.no_mesh:
-        started = time.perf_counter()
-        mesh = stream_mesh(out / "mesh.ply", pipeline.memory, config.mesh)
-        print(
-            f"mesh: {mesh.triangles:,} triangles in {time.perf_counter() - started:.0f} s, "
-            f"peak memory {peak_mb():.0f} MB"
-        )
+        mesh_building(out, options.resolution, pipeline.memory)
     if options.out is None:
         shutil.rmtree(out)
+
+
+def mesh_building(out: Path, resolution: int, memory: MapMemory) -> None:
+    """Write the mesh of all tiles, and print what that takes and whether its seams are closed."""
+    path, settings = out / "mesh.ply", replace(Config().mesh, resolution=resolution)
+    started, spent = time.perf_counter(), time.process_time()
+    mesh = stream_mesh(path, memory, settings)
+    print(
+        f"mesh: {mesh.triangles:,} triangles in {time.perf_counter() - started:.0f} s, "
+        f"{time.process_time() - spent:.0f} s of the processor, peak memory {peak_mb():.0f} MB, "
+        f"{path.stat().st_size / 1e9:.2f} GB",
+        flush=True,
+    )
+    edges, rims, gaps = seams(path, memory.sets["surface"].map.voxel_size)
+    print(
+        f"seams: of {edges:,} edges along borders of tiles {rims:,} end the surface; {gaps:,} have another "
+        "one at the same place, which is not welded"
+    )
+
+
+def seams(path: Path, voxel_size: float) -> tuple[int, int, int]:
+    """Of a mesh's edges on borders between tiles: how many there are, how many have one triangle, and
+    how many of these lie where another one does.
+    """
+    with open(path, "rb") as file:
+        header = list(iter(file.readline, b"end_header\n"))
+        begin = file.tell()
+    vertices, faces = (int(line.split()[2]) for line in header if line.startswith(b"element"))
+    rows = np.memmap(path, VERTEX_ROW, "r", begin, (vertices,))
+    triangles = np.memmap(path, FACE_ROW, "r", begin + rows.nbytes, (faces,))
+    border, places = np.zeros(vertices, bool), []
+    for first in range(0, vertices, ROWS):
+        some = rows[first : first + ROWS]
+        at = np.stack([some[axis] for axis in "xyz"], axis=1)
+        border[first : first + ROWS] = on_border(at, voxel_size)
+        places.append(at[border[first : first + ROWS]])
+    found = []
+    for first in range(0, faces, ROWS):
+        some = triangles[first : first + ROWS]["indices"]
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            found.append(some[border[some[:, a]] & border[some[:, b]]][:, [a, b]])
+    ends = np.searchsorted(np.flatnonzero(border), np.concatenate(found))  # (E, 2)
+    at = np.concatenate(places).view("V12").ravel()
+    _, place = np.unique(at, return_inverse=True)
+    edges, rims = uses_of(ends, len(at))
+    return edges, rims, rims - uses_of(place.reshape(-1)[ends], len(at))[1]
+
+
+def uses_of(ends: NDArray[np.int64], count: int) -> tuple[int, int]:
+    """How many edges there are among the ends (E, 2) of triangles' edges, numbers below `count`, and how
+    many come once.
+    """
+    codes = ends.min(axis=1).astype(np.int64) * count + ends.max(axis=1)
+    uses = np.unique(codes, return_counts=True)[1]
+    return len(uses), int((uses == 1).sum())
 
 
 def blocks_of(surface: TileFolder) -> int:
