@@ -72,10 +72,12 @@ def _move(folder: RunFolder, windows, poses: NewPoses, device: Device) -> Repose
     from .. import runtime
     from ..files.trajectories import write_trajectory
     from ..results.keyframes import repose_keyframes
+    from ..results.ownership import answer_files
     from ..results.reposing import record_reposed
     from ..results.reposing import repose as reposed
 
     runtime.init(device)
+    answers = answer_files(folder)
     try:
         maps, moved = reposed(folder, windows, poses)
         for name, each in maps.maps.items():
@@ -86,7 +88,7 @@ def _move(folder: RunFolder, windows, poses: NewPoses, device: Device) -> Repose
         folder.new_windows.replace(folder.windows)
     finally:
         folder.new_windows.unlink(missing_ok=True)
-    for file in folder.asked:  # answers lie where the map was
+    for file in answers:  # they lie where the map was
         file.unlink()
     return moved
 

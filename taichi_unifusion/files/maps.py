@@ -29,6 +29,7 @@ FORMAT = "taichi_unifusion LIM"
 FORMAT_VERSION = 1
 CONTAINER_KEYS = ("format", "format_version", "tensors")  # of the manifest
 MAX_HEADER = 64 << 20  # [bytes]; ours have a few thousand
+TENSOR_KEYS = {"dtype", "shape", "data_offsets"}  # of the header
 MAX_DIMENSIONS = 8
 # of one tensor, counting empty dimensions as 1, so that no product of sizes overflows
 MAX_ELEMENTS = 1 << 48
@@ -137,6 +138,24 @@ def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     with _open(path) as file:
         return _read_header(file, path)[1]
+
+
+def is_foreign(path: str | os.PathLike[str]) -> bool:
+    """Whether this is a sound safetensors file that somebody else wrote, as the weights of a network; a
+    map that is damaged is not.
+    """
+    try:
+        with _open(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            length = int.from_bytes(file.read(8), "little")
+            header = _parse_json(file.read(length)) if length <= min(size - 8, MAX_HEADER) else {}
+    except (FileError, ValueError):
+        return False
+    metadata = header.pop("__metadata__", {})
+    # ours have both keys: one changed bit leaves the other
+    ours = not isinstance(metadata, dict) or {_MANIFEST, _CHECKSUM} & set(metadata)
+    tensors = [isinstance(each, dict) and set(each) >= TENSOR_KEYS for each in header.values()]
+    return bool(tensors) and all(tensors) and not ours
 
 
 def _storable(name: str, array: NDArray) -> NDArray:

@@ -14,6 +14,7 @@ from ..maps.settings import FeatureSettings
 from ..maps.stored import MapDescription, describe_tiles, read_stored, read_tile
 from ..maps.tile_places import code_of, key_codes
 from .lock import who_writes
+from .ownership import answer_files
 from .record import Source, read_record
 from .run_folder import RunFolder
 from .safe_point import read_state
@@ -72,6 +73,7 @@ def inspect(path: Path) -> Inspection:
     ]
     if path.is_dir():
         texts.append(_describe_answers(RunFolder(path)))
+        texts.append(_describe_foreign(RunFolder(path)))
         texts.append(attempt(_describe_unfinished, RunFolder(path).state))
         texts.append(_describe_writer(RunFolder(path)))
         problems += _find_mixed(RunFolder(path))
@@ -110,8 +112,14 @@ def _describe_features(maps: Sequence[MapDescription]) -> str | None:
 
 def _describe_answers(folder: RunFolder) -> str | None:
     """The files of questions that were put to the maps."""
-    files = ", ".join(map(folder.relative, folder.asked))
+    files = ", ".join(map(folder.relative, answer_files(folder)))
     return f"answers {files}" if files else None
+
+
+def _describe_foreign(folder: RunFolder) -> str | None:
+    """The safetensors files of others that lie among the maps."""
+    files = ", ".join(map(folder.relative, folder.foreign_maps))
+    return f"no map  {files}: written by another program, left alone" if files else None
 
 
 def _checked(file: Path) -> MapDescription:

@@ -68,6 +68,14 @@ def add_answers(folder: RunFolder, files: Iterable[Path]) -> None:
         write_record(folder.record, replace(record, answers=answers))
 
 
+def answer_files(folder: RunFolder) -> tuple[Path, ...]:
+    """The answers that exist and that questions have left, as the record or their own list says: a
+    file with such a name may be the user's.
+    """
+    owned = owned_files(folder) | set(_answers(folder))
+    return tuple(file for file in folder.asked if folder.relative(file) in owned)
+
+
 def describe_earlier(folder: RunFolder) -> str:
     """What a further run would replace, in words; "" where no run has written here."""
     owned = {name for name in owned_files(folder) if (folder.path / name).exists()}

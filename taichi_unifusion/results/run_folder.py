@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from ..files.maps import is_foreign
 from ..files.tiles import INDEX
 
 MESH_SUFFIXES = ("ply", "glb", "obj")  # in the order in which meshes are written
@@ -86,10 +87,16 @@ class RunFolder:
 
     @property
     def maps(self) -> dict[str, Path]:
-        """The maps that exist, by name: files, or folders of tiles."""
-        files = {path.stem: path for path in sorted(self.map_folder.glob(self.map("*").name))}
+        """The maps that exist, by name: files, or folders of tiles; safetensors of others are none."""
+        found = sorted(self.map_folder.glob(self.map("*").name))
+        files = {path.stem: path for path in found if not is_foreign(path)}
         tiled = {path.parent.name: path.parent for path in self.map_folder.glob(f"*/{INDEX}")}
         return dict(sorted({**files, **tiled}.items()))
+
+    @property
+    def foreign_maps(self) -> tuple[Path, ...]:
+        """Files of others that lie where the maps do."""
+        return tuple(filter(is_foreign, sorted(self.map_folder.glob(self.map("*").name))))
 
     @property
     def working_tiles(self) -> Path:
@@ -253,7 +260,9 @@ class RunFolder:
 
     @property
     def asked(self) -> tuple[Path, ...]:
-        """The files that exist of questions asked: they belong to the maps that were asked."""
+        """The files that exist with the names of answers to questions; `ownership.answer_files` are
+        those that are answers.
+        """
         patterns = (self.answer_mesh("*"), self.answer_picture("*"))
         found = {file for pattern in patterns for file in self.path.glob(pattern.name)}
         known = (self.answers, self.answer_columns, *self.segmentation_files)

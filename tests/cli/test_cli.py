@@ -701,6 +701,18 @@ def test_M2_info_names_a_damaged_map_and_still_shows_the_rest(made, tmp_path, ca
     assert "checksum" in capsys.readouterr().err
 
 
+def test_weights_of_a_network_among_the_maps_stand_in_no_ones_way(made, tmp_path, capsys):
+    copy = shutil.copytree(made, tmp_path / "copy")
+    header = b'{"w":{"dtype":"BF16","shape":[2],"data_offsets":[0,4]}}'
+    foreign = len(header).to_bytes(8, "little") + header + bytes(4)
+    (copy / "maps" / "clip.safetensors").write_bytes(foreign)
+    assert cli.main(["mesh", str(copy), "--resolution", "2", "--device", DEVICE]) == 0
+    assert cli.main(["info", str(copy)]) == 0
+    said = capsys.readouterr()
+    assert "maps/clip.safetensors: written by another program" in said.out
+    assert (copy / "maps" / "clip.safetensors").read_bytes() == foreign
+
+
 def test_mesh_refuses_a_map_of_another_kind(made, tmp_path, capsys):
     copy = shutil.copytree(made, tmp_path / "copy")
     shutil.copy(copy / "maps" / "color.safetensors", copy / "maps" / "surface.safetensors")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from taichi_unifusion.errors import FileError, InputError, MapCorrupt
-from taichi_unifusion.files.maps import FORMAT, read_manifest, read_map, write_map
+from taichi_unifusion.files.maps import FORMAT, is_foreign, read_manifest, read_map, write_map
 
 TENSORS = {
     "features": np.random.default_rng(0).normal(size=(7, 20, 3)).astype(np.float32),
@@ -328,3 +328,29 @@ def test_M6_pickles_are_refused_and_do_not_run(tmp_path, name, as_npy):
     with open(tmp_path / name, "rb") as file:  # the payload would have run
         np.load(file, allow_pickle=True) if as_npy else pickle.load(file)
     assert trace.exists()
+
+
+def test_files_of_other_programs_are_told_from_damaged_maps(path):
+    tensor = {"weight": {"dtype": "BF16", "shape": [2], "data_offsets": [0, 4]}}
+    for header in (tensor, {"__metadata__": {"format": "pt"}, **tensor}):
+        text = json.dumps(header).encode()
+        path.write_bytes(len(text).to_bytes(8, "little") + text + bytes(4))
+        assert is_foreign(path)
+        path.write_bytes(path.read_bytes()[:20])
+        assert not is_foreign(path)
+    for nothing in (b"", b"PK\x03\x04", (2).to_bytes(8, "little") + b"{}"):
+        path.write_bytes(nothing)
+        assert not is_foreign(path)
+    assert not is_foreign(path.parent / "none") and not is_foreign(path.parent)
+
+
+def test_no_changed_bit_of_its_header_makes_a_map_a_file_of_others(path):
+    write_map(path, SMALL, MANIFEST)
+    data = path.read_bytes()
+    end = 8 + int.from_bytes(data[:8], "little")
+    for place in range(end):
+        for bit in (1, 2, 4, 32):
+            changed = bytearray(data)
+            changed[place] ^= bit
+            path.write_bytes(changed)
+            assert not is_foreign(path), place

@@ -16,6 +16,7 @@ from taichi_unifusion.properties import SurfaceProperty
 from taichi_unifusion.results import RunFolder, inspect, read_record, write_results, writer
 from taichi_unifusion.results.ownership import (
     add_answers,
+    answer_files,
     describe_earlier,
     is_unfinished,
     mark_unfinished,
@@ -106,6 +107,11 @@ def test_answers_are_owned_by_the_record_or_by_their_own_list(folder):
     folder.answers.write_text(json.dumps(listed))  # as older versions left it
     assert {"query-a.ply", "query.json"} <= owned_files(folder)
     assert "photo.png" not in owned_files(folder)
+    (folder.path / "query-mine.png").touch()  # somebody's own
+    named = [folder.relative(file) for file in answer_files(folder)]
+    assert named == ["query-a.ply", "query-b.ply", "query.json"]
+    told = inspect(folder.path).text
+    assert "query-b.ply" in told and "query-mine.png" not in told
     add_answers(RunFolder(folder.path / "none"), [])  # no record, nothing to do
 
 
