@@ -127,7 +127,7 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
             depth_min=limits.depth_min if options.depth_min is None else options.depth_min,
             depth_max=limits.depth_max if options.depth_max is None else options.depth_max,
         )
-    _check_hits(result)
+    _warn_of_few_hits(result)
     used = set(run.used if run else ()) & {score.index for score in result.frames}
     about = {
         "metric": "rendering",
@@ -154,15 +154,13 @@ def evaluate_rendering(options: EvaluateRendering) -> int:
     )
 
 
-def _check_hits(result: RenderingResult) -> None:
-    """Raise InputError where no ray meets the mesh, and warn where hardly one does."""
-    where = "is it in the world of the frames' poses, in metres?"
-    if not result.coverage:
-        raise InputError(
-            f"rendering: no ray of {len(result.frames)} frames meets the mesh; {where}"
+def _warn_of_few_hits(result: RenderingResult) -> None:
+    """Warn where hardly a ray meets the mesh."""
+    if result.coverage is not None and result.coverage < FEW_HITS:
+        logger.warning(
+            "only %s %% of readings meet the mesh: is it in the world of the frames' poses, in metres?",
+            percent(result.coverage),
         )
-    if result.coverage < FEW_HITS:
-        logger.warning("only %s %% of readings meet the mesh: %s", percent(result.coverage), where)
 
 
 def _images(options: EvaluateRendering, recording: Dataset, color: ColorRecord | None) -> str:

@@ -79,8 +79,8 @@ def evaluate_rendering(
     else its vertex colours, else none. Compared are pixels whose reading lies in depth_min..depth_max [m] and whose
     ray hits; what is not hit lowers `coverage` and `depth_within` only.
 
-    Raises InputError for a mesh that is empty or not finite, where there is no frame, or no frame
-    with a reading in range; PoseError for a frame without a pose.
+    Raises InputError for a mesh that is empty or not finite, where there is no frame, no frame with a
+    reading in range, or no ray of any frame that hits; PoseError for a frame without a pose.
     """
     if not 0 <= depth_min < depth_max:
         raise InputError(
@@ -97,6 +97,11 @@ def evaluate_rendering(
         raise InputError(
             f"rendering: none of {len(scores)} frames has a depth reading in {depth_min:g}..{depth_max:g} m; "
             "is the depth scale wrong?"
+        )
+    if not any(score.coverage for score in scores):
+        raise InputError(
+            f"rendering: no ray of {len(scores)} frames meets the mesh; is it in the world of the frames' "
+            "poses, in metres?"
         )
     means = {name: _mean([getattr(score, name) for score in scores]) for name in MEANS}
     return RenderingResult(**means, frames=scores)

@@ -181,6 +181,12 @@ def test_without_colour_there_is_no_psnr():
         assert (result.psnr_db, result.ssim) == (None, None) and result.coverage == 1
 
 
+def test_a_mesh_that_no_ray_meets_is_refused():
+    away = frame_of(2.0, T_world_camera=at(0, 0, 4))
+    with pytest.raises(InputError, match="no ray of 2 frames meets the mesh"):
+        evaluate_rendering(WALL, [away, away])
+
+
 def test_frames_without_anything_to_compare_are_left_out_of_the_means():
     # looks away from the wall: nothing hit, all readings missed
     away = frame_of(2.0, T_world_camera=at(0, 0, 4))
