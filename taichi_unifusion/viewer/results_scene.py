@@ -24,7 +24,7 @@ from ..geometry.triangles import SurfaceDistance
 from ..maps.stored import read_description, read_stored, read_tile
 from ..maps.tile_places import key_codes, rows_by_tile, tile_of
 from ..maps.voxel_data import VoxelData
-from ..rendering.look import Look
+from ..rendering.look import MOST, Look
 from ..rendering.mesh_checks import check_mesh
 from ..results.outlook import find_mesh_up, read_up
 from ..results.property_files import recorded_looks
@@ -37,6 +37,7 @@ from .scene import Layer, Scene, SceneCamera, SceneMesh
 
 logger = logging.getLogger(__name__)
 
+SHORTEST = 0.001  # [m] that the colours of distances reach at least
 CELLS = 4  # of a voxel along an edge, in which evidence is counted
 COLOR, NORMALS, HEIGHT = "color", "normals", "height"
 GREY = 200  # of a mesh that has no colours
@@ -250,7 +251,9 @@ def distance_layer(mesh: Mesh, other: Path) -> Layer:
     """Distance [m] of every vertex to the surface of another mesh, which is in the same world."""
     truth = check_mesh(read_any_mesh(other), str(other))
     distances = SurfaceDistance(truth.vertices, truth.faces)(mesh.vertices)
-    look = Look("inferno", None, f"distance to {other.name} [m]")
+    finite = distances[np.isfinite(distances)]
+    most = float(np.percentile(finite, MOST[1])) if len(finite) else 0.0
+    look = Look("inferno", (0.0, max(most, SHORTEST)), f"distance to {other.name} [m]")
     return Layer.of_values(f"distance to {other.name}", distances, look)
 
 

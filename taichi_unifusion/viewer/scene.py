@@ -21,6 +21,7 @@ from ..types import Mesh, PinholeCamera, check_rigid
 UNKNOWN = (120, 120, 125)  # RGB of a vertex that has no value
 OUTLIERS = 0.5  # percent of the vertices at either end that do not count for the size of a scene
 AZIMUTHS, LOOKED_AT = 24, 50_000  # sides that an overview may be from; triangles that choose it
+LEAST_SHARE = 5e-4  # of the range of a layer, below which a value at a point is said to be 0
 DISTANCE = 1.8  # of an overview from the middle of a scene, in half its diagonal
 
 
@@ -120,6 +121,9 @@ class Layer:
             return "unknown"
         if self.legend is not None and self.legend.names:
             return self.legend.names[int(values[0])]
+        if self.legend is not None:  # of a range of 1, 3.2e-13 is read as 0
+            least = LEAST_SHARE * (self.legend.high - self.legend.low)
+            values = np.where(np.abs(values) < least, 0.0, values)
         numbers = ", ".join(map(short_number, values))
         return numbers if len(values) == 1 else f"({numbers})"
 

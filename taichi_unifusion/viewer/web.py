@@ -15,6 +15,7 @@ import queue
 import socket
 import sys
 import time
+import warnings
 import webbrowser
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -33,6 +34,7 @@ logger = logging.getLogger(__name__)
 HOME = "127.0.0.1"  # only this machine can open the page
 PORT, PORTS = 8080, 100  # the first port that is tried, and how many
 FLIGHT_STEPS, FLIGHT_PAUSE = 12, 0.03  # [s] of a camera on its way
+GONE = r"Queued an? \w+ on a closed connection"  # as viser warns
 WAIT = 0.2  # [s] between two looks at whether to stop
 
 
@@ -121,6 +123,8 @@ def start_server(host: str, port: int, title: str) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
+    # a browser may go away before it is answered
+    warnings.filterwarnings("ignore", GONE, UserWarning)
     port = free_port(host, port)
     with _quiet():
         server = LocalServer(host=host, port=port, label=title, verbose=False)

@@ -14,6 +14,9 @@ STOPS = 17  # of the gradient of a legend
 SMALL = (
     "font-size: 0.85em; line-height: 1.35; padding: 0 0.9em 0.5em 0.9em; overflow-wrap: anywhere;"
 )
+NAME = (
+    "opacity: 0.65; padding-right: 0.8em; vertical-align: top; overflow-wrap: normal"  # whole words
+)
 SWATCHES = 30  # classes in a legend
 
 
@@ -25,8 +28,7 @@ def paragraph(text: str) -> str:
 def table(rows: Iterable[tuple[str, str]]) -> str:
     """Names and values, one a line."""
     lines = "".join(
-        f'<tr><td style="opacity: 0.65; padding-right: 0.8em; vertical-align: top">{escape(name)}</td>'
-        f"<td>{escape(value)}</td></tr>"
+        f'<tr><td style="{NAME}">{escape(name)}</td><td>{escape(value)}</td></tr>'
         for name, value in rows
     )
     return f'<div style="{SMALL}"><table>{lines}</table></div>'

@@ -46,6 +46,8 @@ class WindowLive:
         window.on_space = self.pause
         window.said = "waiting for the first frame"
         self.paused = False
+        for _ in range(2):  # text appears in the second picture
+            self._draw(due=True)
 
     def pause(self) -> None:
         """Let the run wait, or go on."""

@@ -205,6 +205,19 @@ def test_a_browser_that_comes_back_finds_the_scene(shown, page):
     assert "query: red" in control(shown, "Layer").get_attribute("value")
 
 
+def test_a_page_that_goes_away_before_it_is_answered_is_no_warning(browser, recwarn):
+    viewer, first = WebViewer(port=some_port()), browser.current_window_handle
+    browser.switch_to.new_window("tab")
+    browser.get(viewer.address)
+    (client,) = until(viewer.server.get_clients, "the page to connect").values()
+    browser.close()
+    browser.switch_to.window(first)
+    until(lambda: not viewer.server.get_clients(), "the page to be gone")
+    viewer.say("Extracted", "too late", client)
+    viewer.close()
+    assert not [each for each in recwarn if "closed connection" in str(each.message)]
+
+
 PATCHES = {  # of a layer: the colours of what faces up, and of two walls
     "color": [(228, 166, 99), (10, 12, 14), (235, 20, 10)],
     "paint": [(128, 128, 128), (0, 60, 255), (240, 240, 60)],

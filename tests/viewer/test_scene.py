@@ -148,6 +148,7 @@ def test_distances_to_another_mesh_are_a_layer(tmp_path):
     layer = scene.meshes[0].layer("distance to below.ply")
     assert np.allclose(layer.values, 0.25, atol=EXACT)
     assert layer.legend.label == "distance to below.ply [m]"
+    assert (layer.legend.low, layer.legend.high) == pytest.approx((0, 0.25), abs=EXACT)
 
 
 @pytest.mark.parametrize(
@@ -167,6 +168,7 @@ def test_values_become_the_colours_of_their_look_and_unknown_ones_grey():
     assert layer.colors[:3].tolist() == [[0] * 3, [128] * 3, [255] * 3]
     assert layer.describe(layer.values[3]) == "unknown" and len(set(layer.colors[3].tolist())) > 1
     assert (layer.legend.label, layer.legend.low, layer.legend.high) == ("heat [K]", 0.0, 1.0)
+    assert [layer.describe(np.array([v])) for v in (-3e-13, 0.481, 2.0)] == ["0", "0.481", "2"]
     with pytest.raises(InputError, match="2 channels"):
         Layer.of_values("pair", np.zeros((4, 2)), Look())
 

@@ -127,9 +127,15 @@ from taichi_unifusion.viewer.window_live import WindowLive
 
 pipeline, frames = Pipeline(replace(CONFIG, window=1)), make_frames(12)
 window = SceneWindow("live", size=(320, 240), visible=False)
-window.poll = lambda: window.picture() is not None and window.open  # nobody sees it
+drawn = []
+
+def poll():  # nobody sees it
+    drawn.append(window.said)
+    return window.picture() is not None and window.open
+
+window.poll = poll
 live = WindowLive(window, len(frames), stop=lambda: False)
-seen = []
+seen, first = [], list(drawn)
 
 def on_step(frame, step, running):
     live.pace.due = 0.0
@@ -142,7 +148,7 @@ def on_step(frame, step, running):
 run = pipeline.run(frames, on_step=on_step)
 live.finish("nowhere")
 picture = seen[-1]
-print(json.dumps({"used": len(run.steps), "seen": seen, "said": window.said, "open": window.open}))
+print(json.dumps({"used": len(run.steps), "seen": seen, "said": window.said, "open": window.open, "first": first}))
 """
 
 
@@ -171,6 +177,7 @@ def test_on_a_screen_keys_switch_layers_the_mouse_turns_and_escape_ends(tmp_path
 
 def test_a_run_grows_in_the_window_and_goes_on_without_it():
     told = run_python(CLOSED_WHILE_RUNNING, VK_ICD_FILENAMES=lavapipe())
+    assert told["first"] == ["waiting for the first frame"] * 2  # text appears in the second
     assert told["used"] == 12 and told["open"] is False
     triangles = [count for count, _ in told["seen"]]
     assert len(triangles) >= 6 and triangles[5] > triangles[0] > 0
