@@ -39,8 +39,10 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
     "--disable-dev-shm-usage",
 )
-# what the page says of the renderer
-HIDE_NOTES = "document.querySelectorAll('.mantine-Notification-root').forEach(e => e.remove())"
+# what the page says of the renderer; removed it would end the page, which closes its notes itself
+HIDE_NOTES = (
+    "document.querySelectorAll('.mantine-Notification-root').forEach(e => e.style.display = 'none')"
+)
 
 
 def main() -> None:
