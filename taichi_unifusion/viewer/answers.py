@@ -29,12 +29,12 @@ class ShownAnswer:
     rows: tuple[str, ...]  # one a box: rank, score and area in words
     sentence: str  # what was found, or that nothing was
 
-    def moved(self, by: NDArray) -> ShownAnswer:
-        """The same answer elsewhere in the scene, (3,) [m]."""
+    def placed(self, T: NDArray) -> ShownAnswer:
+        """The same answer elsewhere in the scene, moved and turned by a rigid T (4, 4)."""
         return replace(
             self,
-            boxes=tuple(replace(box, corners=box.corners + by) for box in self.boxes),
-            labels=tuple(replace(each, position=each.position + by) for each in self.labels),
+            boxes=tuple(each.placed(T) for each in self.boxes),
+            labels=tuple(each.placed(T) for each in self.labels),
         )
 
 

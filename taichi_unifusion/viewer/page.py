@@ -127,7 +127,7 @@ def _encode_mesh(blob: _Blob, scene: Scene, shown: SceneMesh) -> dict[str, Any]:
     return {
         "name": shown.name,
         "note": shown.note,
-        "offset": _rounded(shown.offset),
+        "T_map": _rounded(np.linalg.inv(scene.T_up_world @ shown.T_scene_map)),
         "low": _rounded(low),
         "scale": scale.tolist(),
         "vertices": len(order),

@@ -72,11 +72,9 @@ def write_part(path: Path, shown: SceneMesh, corners: NDArray, T_up_scene: NDArr
     """Write the triangles of a mesh inside a box (2, 3) up [m], in the mesh's own world, with all
     that its vertices carry; raises InputError where there is none, FileError.
     """
-    part = _inside(shown, corners, T_up_scene).mesh
-    if not len(part.faces):
+    mesh = _inside(shown, corners, T_up_scene).in_map()
+    if not len(mesh.faces):
         raise InputError("the box holds no triangle; draw it around some surface")
-    vertices = (part.vertices - shown.offset).astype(np.float32)
-    mesh = Mesh(vertices, part.faces, part.normals, part.attributes)
     write_mesh(path, mesh)
     return mesh
 

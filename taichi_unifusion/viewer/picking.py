@@ -29,7 +29,13 @@ class Hit:
     @property
     def point_in_map(self) -> NDArray[np.float64]:
         """(3,) [m] in the mesh's own world."""
-        return self.point - self.shown.offset
+        T = np.linalg.inv(self.shown.T_scene_map)
+        return T[:3, :3] @ self.point + T[:3, 3]
+
+    @property
+    def normal_in_map(self) -> NDArray[np.float64]:
+        """(3,) unit, in the mesh's own world."""
+        return self.normal @ self.shown.T_scene_map[:3, :3]
 
     def color(self, layer: Layer) -> NDArray[np.uint8]:
         """(3,) RGB of a layer here."""

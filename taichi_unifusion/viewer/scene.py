@@ -1,7 +1,7 @@
 """Scene: what there is to see, as frozen values that know no back end.
 
 Frames of reference: *scene* is what the arrays here are in; `up` is a frame whose z points away
-from gravity. A mesh that stands elsewhere than in its own world says by how much (`offset`).
+from gravity. A mesh that stands elsewhere than in its own world says how (`T_scene_map`).
 """
 
 from __future__ import annotations
@@ -136,8 +136,8 @@ class SceneMesh:
     mesh: Mesh  # scene [m]; its attributes are not looked at
     layers: tuple[Layer, ...]  # at least one; the first is shown first
     note: str = ""  # what was done to it, for whoever looks at it
-    # (3,) [m] the mesh's own world + offset = scene: results may stand side by side
-    offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    # (4, 4) from the mesh's own world, that of its map: results may stand side by side
+    T_scene_map: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
         if not self.layers:
@@ -170,12 +170,13 @@ class SceneMesh:
             return self.mesh.normals
         return vertex_normals(self.mesh.vertices, self.mesh.faces)
 
-    def moved(self, by: NDArray) -> SceneMesh:
-        """The same mesh elsewhere in the scene, (3,) [m]."""
-        vertices = (self.mesh.vertices + by).astype(np.float32)
-        return replace(
-            self, mesh=replace(self.mesh, vertices=vertices), offset=self.offset + np.asarray(by)
-        )
+    def placed(self, T: NDArray) -> SceneMesh:
+        """The same mesh elsewhere in the scene, moved and turned by a rigid T (4, 4)."""
+        return replace(self, mesh=_turned(self.mesh, T), T_scene_map=T @ self.T_scene_map)
+
+    def in_map(self) -> Mesh:
+        """The mesh in its own world."""
+        return _turned(self.mesh, np.linalg.inv(self.T_scene_map))
 
     def part(self, inside: NDArray[np.bool_]) -> SceneMesh:
         """The triangles of which all corners are `inside` (V,), with their vertices."""
@@ -193,11 +194,9 @@ class SceneCamera:
     image: NDArray[np.uint8] | None = None  # (h, w, 3) RGB, of any size
     frame: int | None = None  # place in its recording
 
-    def moved(self, by: NDArray) -> SceneCamera:
-        """The same camera elsewhere in the scene, (3,) [m]."""
-        T = self.T_world_camera.copy()
-        T[:3, 3] += by
-        return replace(self, T_world_camera=T)
+    def placed(self, T: NDArray) -> SceneCamera:
+        """The same camera elsewhere in the scene, moved and turned by a rigid T (4, 4)."""
+        return replace(self, T_world_camera=T @ self.T_world_camera)
 
 
 @dataclass(frozen=True)
@@ -208,6 +207,11 @@ class Box:
     corners: NDArray[np.float64]  # (2, 3) [m] lowest and highest
     color: tuple[int, int, int] = (255, 210, 60)
 
+    def placed(self, T: NDArray) -> Box:
+        """A box around this one, moved and turned by a rigid T (4, 4)."""
+        corners = np.array(np.meshgrid(*self.corners.T)).reshape(3, -1).T @ T[:3, :3].T + T[:3, 3]
+        return replace(self, corners=np.stack([corners.min(axis=0), corners.max(axis=0)]))
+
 
 @dataclass(frozen=True)
 class Label:
@@ -215,6 +219,10 @@ class Label:
 
     text: str
     position: NDArray[np.float64]  # (3,) [m]
+
+    def placed(self, T: NDArray) -> Label:
+        """The same text elsewhere, moved and turned by a rigid T (4, 4)."""
+        return replace(self, position=T[:3, :3] @ self.position + T[:3, 3])
 
 
 @dataclass(frozen=True)
@@ -236,6 +244,17 @@ class Scene:
         """The same scene of one mesh under another name."""
         return replace(
             self, name=name, meshes=tuple(replace(each, name=name) for each in self.meshes)
+        )
+
+    def placed(self, T: NDArray) -> Scene:
+        """The same scene, moved and turned by a rigid T (4, 4)."""
+        return replace(
+            self,
+            meshes=tuple(each.placed(T) for each in self.meshes),
+            cameras=tuple(each.placed(T) for each in self.cameras),
+            boxes=tuple(each.placed(T) for each in self.boxes),
+            labels=tuple(each.placed(T) for each in self.labels),
+            T_up_world=self.T_up_world @ np.linalg.inv(T),
         )
 
     @property
@@ -304,3 +323,10 @@ class Scene:
 def short_number(value: float) -> str:
     """A number as people read it: three digits, or a whole number where it has more."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def _turned(mesh: Mesh, T: NDArray) -> Mesh:
+    """A mesh moved and turned by a rigid T (4, 4), with its normals."""
+    vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+    normals = None if mesh.normals is None else (mesh.normals @ T[:3, :3].T).astype(np.float32)
+    return replace(mesh, vertices=vertices.astype(np.float32), normals=normals)

@@ -11,20 +11,32 @@ from numpy.typing import NDArray
 from .scene import UNKNOWN, Layer, Legend, Scene, SceneMesh
 
 APART = 0.15  # of the width of a result: the gap to the next one beside it
+SAME_UP = float(np.cos(np.radians(5)))  # of two that were found in the same world
 SHARED = ", one scale for all"  # at the end of a legend's label
 
 
 def beside(scenes: Sequence[Scene]) -> Scene:
-    """Several scenes in one, from left to right; boxes and labels move along with their meshes."""
+    """Several scenes in one, from left to right, each upright: one whose world has another up than that
+    of the first is turned. Boxes and labels go along with their meshes.
+    """
+    first = scenes[0]
     placed, place = [], 0.0
-    right = _right_of(scenes[0])
-    for scene in scenes:
+    right = _right_of(first)
+    for scene in (first, *(_upright_as(first, each) for each in scenes[1:])):
         corners = np.array(np.meshgrid(*scene.bounds().T)).reshape(3, -1).T @ right
         low, high = float(corners.min()), float(corners.max())
-        by = (place - low) * right if placed else np.zeros(3)
+        T = np.eye(4)
+        T[:3, 3] = (place - low) * right if placed else 0
         place = (high if not placed else place + high - low) + APART * (high - low)
-        placed.append(_moved(scene, by))
+        placed.append(scene.placed(T))
     return overlaid(placed)
+
+
+def _upright_as(first: Scene, other: Scene) -> Scene:
+    """The other scene with its floor and its up where the first has them, if their worlds differ."""
+    if float(first.up @ other.up) > SAME_UP:
+        return other
+    return other.placed(np.linalg.inv(first.T_up_world) @ other.T_up_world)
 
 
 def overlaid(scenes: Sequence[Scene]) -> Scene:
@@ -45,16 +57,6 @@ def _right_of(scene: Scene) -> NDArray[np.float64]:
     eye, center = scene.overview()
     right = np.cross(center - eye, scene.up)
     return right / np.linalg.norm(right)
-
-
-def _moved(scene: Scene, by: NDArray) -> Scene:
-    return replace(
-        scene,
-        meshes=tuple(mesh.moved(by) for mesh in scene.meshes),
-        cameras=tuple(camera.moved(by) for camera in scene.cameras),
-        boxes=tuple(replace(box, corners=box.corners + by) for box in scene.boxes),
-        labels=tuple(replace(label, position=label.position + by) for label in scene.labels),
-    )
 
 
 def with_shared_scales(scenes: Sequence[Scene]) -> list[Scene]:

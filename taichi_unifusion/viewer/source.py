@@ -5,7 +5,7 @@ which are loaded when they are first needed.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -133,8 +133,9 @@ class ResultsSource:
             mesh = joined_mesh(self._memory, resolution, settings.min_area, on_piece=on_piece)
         else:
             mesh = self._whole_mesh(resolution, settings.min_area, on_piece)
-        layers = layers_of(mesh, folder, scene, self.options.compare)
-        return SceneMesh(shown.name, mesh, layers).moved(shown.offset)
+        own = replace(scene, T_up_world=scene.T_up_world @ shown.T_scene_map)
+        layers = layers_of(mesh, folder, own, self.options.compare)
+        return SceneMesh(shown.name, mesh, layers).placed(shown.T_scene_map)
 
     def _whole_mesh(
         self, resolution: int, min_area: float, on_piece: Callable[[int, int], None]
@@ -158,10 +159,10 @@ class ResultsSource:
         from ..language.questions import ask
 
         mesh = shown.colored(shown.layers[0].name)
-        there = Mesh(shown.mesh.vertices - np.float32(shown.offset), mesh.faces, mesh.normals)
+        there = replace(shown, mesh=mesh).in_map()
         answer = ask(self._features, there, self._encoder, [text])[0]
         found = show_answer(mesh, text, answer.relevance, answer.regions)
-        return found.moved(shown.offset)
+        return found.placed(shown.T_scene_map)
 
     def words_at(self, point: NDArray) -> list[tuple[str, float]]:
         """The words nearest to the features at a point (3,) [m] of the map, with their cosines, best

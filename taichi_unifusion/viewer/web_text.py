@@ -72,7 +72,7 @@ def describe_hit(scene: Scene, hit: Hit, words: list[tuple[str, float]]) -> list
     rows += [
         ("position", f"{x:z.3f}, {y:z.3f}, {z:z.3f} m"),
         ("height", f"{float(scene.heights_of(hit.point[None])[0]):z.3f} m"),
-        ("normal", ", ".join(f"{part:z.2f}" for part in hit.normal)),
+        ("normal", ", ".join(f"{part:z.2f}" for part in hit.normal_in_map)),
     ]
     for layer in hit.shown.layers:
         values = hit.values(layer)

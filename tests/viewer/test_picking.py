@@ -22,6 +22,12 @@ from taichi_unifusion.viewer.scene import Layer, SceneMesh
 EXACT = 1e-5  # [m] of float32 coordinates of a room
 
 
+def along_x(by: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = by
+    return T
+
+
 def floor(steps: int = 10) -> SceneMesh:
     """A square metre at z = 0 that faces up, with its x as values."""
     mesh = rectangle((0, 0), (1, 1), 0.0, steps=steps)
@@ -70,7 +76,7 @@ def floor_layers(count: int) -> tuple[Layer, ...]:
 
 
 def test_what_stands_aside_is_met_there_and_known_in_its_own_world():
-    moved = floor().moved(np.array([10.0, 0.0, 0.0]))
+    moved = floor().placed(along_x(10.0))
     hit = Picker(moved).pick(np.array([10.5, 0.5, 2.0]), np.array([0.0, 0.0, -1.0]))
     assert np.allclose(hit.point, (10.5, 0.5, 0), atol=EXACT)
     assert np.allclose(hit.point_in_map, (0.5, 0.5, 0), atol=EXACT)
@@ -94,7 +100,7 @@ def test_a_rectangle_of_a_view_becomes_a_box_around_what_it_shows():
 
 def test_a_box_holds_its_share_of_the_surface():
     corners = np.array([[-0.01, -0.01, -0.5], [0.51, 0.31, 0.5]])
-    measured = measure_box([floor(), floor().moved(np.array([10.0, 0, 0]))], corners, np.eye(4))
+    measured = measure_box([floor(), floor().placed(along_x(10.0))], corners, np.eye(4))
     assert measured.area == pytest.approx(0.5 * 0.3, abs=EXACT)
     assert measured.volume == pytest.approx(0.52 * 0.32 * 1.0)
     assert measured.triangles == 5 * 3 * 2
@@ -110,7 +116,7 @@ def test_boxes_stand_upright_whatever_the_world():
 
 
 def test_a_part_is_written_in_its_own_world_with_its_values(tmp_path):
-    moved = floor().moved(np.array([10.0, 0, 0]))
+    moved = floor().placed(along_x(10.0))
     corners = np.array([[9.99, -0.01, -0.5], [10.51, 0.31, 0.5]])
     write_part(tmp_path / "part.ply", moved, corners, np.eye(4))
     part: Mesh = read_mesh(tmp_path / "part.ply")

@@ -21,8 +21,9 @@ from taichi_unifusion.files.meshes import write_mesh
 from taichi_unifusion.maps import SurfaceMap
 from taichi_unifusion.rendering.look import Look
 from taichi_unifusion.viewer import source as source_module
+from taichi_unifusion.viewer.picking import Picker
 from taichi_unifusion.viewer.results_scene import SceneOptions, open_scene
-from taichi_unifusion.viewer.scene import Layer, Scene, SceneMesh
+from taichi_unifusion.viewer.scene import Box, Layer, Scene, SceneMesh
 from taichi_unifusion.viewer.several import beside, overlaid, with_shared_scales
 from taichi_unifusion.viewer.source import ResultsSource
 
@@ -202,8 +203,25 @@ def test_scenes_beside_each_other_do_not_touch_and_say_where_they_were():
     for left, other in zip(spans, spans[1:], strict=False):
         assert left.max() < other.min()
     for mesh in scene.meshes:
-        assert np.allclose(mesh.mesh.vertices - mesh.offset, box(ZERO, ONE).vertices, atol=EXACT)
-    assert [mesh.offset.tolist() for mesh in overlaid(cubes).meshes] == [[0.0] * 3] * 3
+        assert np.allclose(mesh.in_map().vertices, box(ZERO, ONE).vertices, atol=EXACT)
+    assert all(np.array_equal(mesh.T_scene_map, np.eye(4)) for mesh in overlaid(cubes).meshes)
+
+
+def test_scenes_of_worlds_with_another_up_stand_upright_beside_each_other():
+    T = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # y points down
+    room = rectangle((0, 0), (2, 1), 1.0, steps=2)
+    other = Mesh(((room.vertices - T[:3, 3]) @ T[:3, :3]).astype(np.float32), room.faces)
+    marks = {"boxes": (Box("a", np.array([[0.0, 0.3, 0], [1, 0.5, 1]])),)}
+    scene = beside([Scene("a", (plain(room),)), Scene("b", (plain(other),), **marks, T_up_world=T)])
+    one, two = (scene.heights_of(mesh.mesh.vertices) for mesh in scene.meshes)
+    assert np.allclose(one, 1, atol=EXACT) and np.allclose(two, 1, atol=EXACT)
+    assert np.allclose(scene.meshes[1].in_map().vertices, other.vertices, atol=EXACT)
+    assert np.allclose(scene.heights_of(scene.boxes[0].corners), [1.0, 1.2], atol=EXACT)
+    hit = Picker(scene.meshes[1]).pick(
+        scene.meshes[1].mesh.vertices.mean(axis=0) + [0, 0, 1], np.array([0.1, 0.1, -1])
+    )
+    assert np.allclose(hit.normal_in_map, [0, -1, 0], atol=EXACT)
+    assert hit.point_in_map[1] == pytest.approx(0.5, abs=EXACT)
 
 
 def of_values(name: str, values, look: Look, classes: dict) -> Scene:

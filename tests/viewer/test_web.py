@@ -349,7 +349,7 @@ def test_results_side_by_side_share_layers_and_can_be_hidden(viewer, results):
     page.layers.show("saliency")
     assert [nodes.current for nodes in page.stage.nodes] == ["saliency"] * 2
     origin, direction = ray_of(page, 0)
-    by = page.scene.meshes[1].offset
+    by = page.scene.meshes[1].T_scene_map[:3, 3]
     assert page.stage.pick(origin, direction)[0] == 0
     assert page.stage.pick(origin + by, direction)[0] == 1
     page.stage.set_visible(1, False)
