@@ -24,7 +24,7 @@ from ..rendering.mesh_checks import check_mesh
 from ..types import Mesh
 from .outlook import read_up
 from .property_files import recorded_looks
-from .run_folder import RunFolder
+from .run_folder import RunFolder, why_no_mesh
 
 COLOR = "color"
 
@@ -87,10 +87,7 @@ def read_export_source(folder: RunFolder, name: str, device: str) -> ExportSourc
     no mesh, InputError where the mesh is empty or does not carry the property.
     """
     if not folder.mesh.exists():
-        raise FileError(
-            f"{folder.mesh}: no such file; give a results folder, or make its mesh with: "
-            f"unifusion mesh {folder.path}"
-        )
+        raise FileError(why_no_mesh(folder))
     mesh = check_mesh(read_mesh(folder.mesh), str(folder.mesh))
     up = read_up(folder, mesh)
     if name == COLOR:

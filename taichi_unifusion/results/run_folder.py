@@ -10,6 +10,7 @@ from ..files.maps import is_foreign
 from ..files.tiles import INDEX
 
 MESH_SUFFIXES = ("ply", "glb", "obj")  # in the order in which meshes are written
+NAMED = 5  # folders in a message
 
 
 @dataclass(frozen=True)
@@ -311,3 +312,15 @@ class RunFolder:
     def relative(self, file: Path) -> str:
         """The name of a file in messages and records: relative to the folder."""
         return file.relative_to(self.path).as_posix()
+
+
+def why_no_mesh(folder: RunFolder) -> str:
+    """What to say of a folder without a mesh: maybe the results lie in folders in it."""
+    inner = sorted(file.parent for file in folder.path.glob(f"*/{folder.mesh.name}"))
+    if inner and not folder.maps:
+        named = ", ".join(map(str, inner[:NAMED])) + ", ..." * (len(inner) > NAMED)
+        return f"{folder.path}: is no results folder; those in it are {named}"
+    return (
+        f"{folder.mesh}: no such file; give a results folder, or make its mesh with: unifusion mesh "
+        f"{folder.path}"
+    )

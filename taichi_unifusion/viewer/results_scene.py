@@ -29,7 +29,7 @@ from ..rendering.mesh_checks import check_mesh
 from ..results.outlook import find_mesh_up, read_up
 from ..results.property_files import recorded_looks
 from ..results.reader import Run, read_run
-from ..results.run_folder import RunFolder
+from ..results.run_folder import RunFolder, why_no_mesh
 from ..results.safe_point import mesh_of_safe_point
 from ..types import Mesh, PinholeCamera
 from .answers import relevance_layer
@@ -68,9 +68,7 @@ def open_scene(path: str | Path, options: SceneOptions | None = None) -> Scene:
     elif (unfinished := mesh_of_safe_point(folder)) is not None:
         mesh = unfinished
     else:
-        raise FileError(
-            f"{folder.mesh}: no such file; give a results folder, or make its mesh with: unifusion mesh {path}"
-        )
+        raise FileError(why_no_mesh(folder))
     mesh = check_mesh(mesh, str(source))
     bare = Scene(path.name or str(path), (), T_up_world=up_of(folder, mesh))
     layers = layers_of(mesh, folder, bare, options.compare)

@@ -163,6 +163,13 @@ def test_what_has_no_mesh_is_said(tmp_path, name, error):
         open_scene(tmp_path / name)
 
 
+def test_the_folder_above_results_names_them(tmp_path):
+    (tmp_path / "demo").mkdir()
+    write_mesh(tmp_path / "demo" / "mesh.ply", rectangle((0, 0), (1, 1), 0.0))
+    with pytest.raises(FileError, match=r"is no results folder; those in it are .*/demo$"):
+        open_scene(tmp_path)
+
+
 def test_values_become_the_colours_of_their_look_and_unknown_ones_grey():
     values = np.array([0.0, 0.5, 1.0, np.nan])
     layer = Layer.of_values("heat", values, Look("gray", (0.0, 1.0), "heat [K]"))
