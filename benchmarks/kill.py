@@ -2,6 +2,8 @@
 map of an undisturbed one.
 
     python benchmarks/kill.py --kills 100
+    python benchmarks/kill.py --kills 20 --run one-pass     tracked and mapped in one pass
+    python benchmarks/kill.py --kills 20 --run windows      at given poses, with --keep-windows
 
 Each process gets `--resume` and dies after a random time of the processor (Linux), until one comes
 through; then the next run begins. Prints how often, where it was, and what was found.
@@ -21,6 +23,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
@@ -49,6 +52,15 @@ class Options:
     """It ends after so long, with fewer kills."""
     seed: int = 0
     """Of the moments."""
+    run: Literal["given", "windows", "one-pass"] = "given"
+    """Frames at given poses, the same with their windows kept, or frames alone in one pass."""
+
+
+RUNS = {
+    "given": [],
+    "windows": ["--keep-windows"],
+    "one-pass": ["--tracking", "rgbd", "--tracking-passes", "1"],
+}
 
 
 def command(out: Path, options: Options, *more: str, share: str = EAGER) -> list[str]:
@@ -56,7 +68,7 @@ def command(out: Path, options: Options, *more: str, share: str = EAGER) -> list
         *(sys.executable, "-c", PROGRAM, share, "reconstruct", "synthetic"),
         *("--option", "width=160", "--option", "height=120", "--end", str(options.frames)),
         *("--device", "cpu", "--threads", "1", "--window", "4", "--surface.voxel-size", "0.1"),
-        *("--color.voxel-size", "0.05", "--out", str(out), *more),
+        *("--color.voxel-size", "0.05", "--out", str(out), *RUNS[options.run], *more),
     ]
 
 
@@ -87,7 +99,8 @@ def processor_seconds(pid: int) -> float:
 
 
 def contents(folder: RunFolder) -> dict[str, bytes]:
-    files = [*folder.maps.values(), folder.mesh]
+    files = [*folder.maps.values(), folder.mesh, folder.trajectory]
+    files += [file for file in (folder.tracking, folder.tracked_poses) if file.exists()]
     return {file.name: file.read_bytes() for file in files}
 
 

@@ -42,6 +42,7 @@ TURN = np.radians(0.3) / 0.05  # [rad/m] of drift
 BEHIND = 0.10  # [m] a second surface this near behind the first is a double one
 SKIN = 0.004  # [m] behind a hit from where on the ray is looked at again
 SHOWN = 100  # cycles between two looks at the maps
+WARM = 25  # frames of a run that compiles
 STRIDE = 4  # pixels between the rays that ask for double surfaces
 
 
@@ -197,16 +198,33 @@ def compare(scene: Scene, drift: float) -> dict[str, dict[str, float | None]]:
 
 
 def cost(format: str, path: str, data: Path, end: int, drift: float) -> None:
-    """What following adds to the time of mapping every frame of a video whose loop moves all of it."""
+    """What following adds to the time of mapping every frame of a video whose loop moves all of it: of windows
+    that are fused at once, as while somebody watches, and of windows that wait for their final poses.
+    """
     recording = uf.open_dataset(format, data / path)[:end]
     frames = [recording[i] for i in range(len(recording))]
     poses = with_drift(np.array([frame.require_pose() for frame in frames]), drift)
-    fuse(frames[:25], WindowStore())  # compiles
-    without = fuse(at_poses(frames, poses.drifted), None)
-    run = fuse(at_poses(frames, poses.drifted), WindowStore())
-    details = follow(run, frames, poses.corrected).details
-    details |= {"keeping_to_without": run.seconds / without.seconds, "frames": len(frames)}
-    print(" | ".join(f"{key} {value:.3g}" for key, value in details.items()), flush=True)
+    at_once = at_poses(frames, poses.drifted)
+    waiting = [replace(frame, apart=True) for frame in at_once]
+    kinds = {
+        "without keeping": (at_once, None, None),
+        "fused at once, no loop": (at_once, WindowStore, None),
+        "fused at once, a loop": (at_once, WindowStore, poses.corrected),
+        "fused in the end, no loop": (waiting, WindowStore, poses.drifted),
+        "fused in the end, a loop": (waiting, WindowStore, poses.corrected),
+    }
+    spent: dict[str, float] = {}
+    for name, (given, store, final) in kinds.items():
+        details: dict[str, float] = {}
+        for part in (given[:WARM], given):  # the first compiles: kernels know the index of a map
+            run = fuse(part, store and store())
+            if final is not None:
+                run = follow(run, part, final[: len(part)])
+            spent[name], details = 1e3 * run.seconds / len(part), run.details
+            del run  # another map takes its index over
+        shares = {"ms_a_frame": spent[name], "to_without": spent[name] / spent["without keeping"]}
+        cells = " | ".join(f"{key} {value:.3g}" for key, value in (shares | details).items())
+        print(f"{len(frames)} frames | {name} | {cells}", flush=True)
 
 
 def kept(scene: Scene) -> None:

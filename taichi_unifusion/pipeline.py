@@ -229,7 +229,7 @@ class Pipeline:
                     if self.fusion.keep is None:
                         done[name] = each.integrate_patches(patches)
                     else:
-                        done[name], kept = each.integrate_and_keep(patches)
+                        done[name], kept = each.integrate_and_keep(patches, fuse=not frame.apart)
                         self.fusion.attach([kept])
         alone = [group for group in self.groups if not group.sums_up]
         if not alone:

@@ -16,13 +16,16 @@ from ..types import Trajectory
 from .color_camera import AUTO
 from .into import Addition, remembered
 from .options import OutputOptions, RunOptions
+from .resuming import make_pipeline
 from .run import Mapped, Run
+from .terminal import frame_progress
 from .viewing import map_frames
 
 if TYPE_CHECKING:
     from ..maps.window_store import WindowStore
     from ..pipeline import Pipeline
     from ..results import RunFolder
+    from ..results.saver import RunSaver
     from ..run_log import RunResult
     from ..tracking import CurrentPoses, TrackingResult
 
@@ -64,17 +67,22 @@ def open_store(
     *,
     moves: bool,
     added: Addition | None = None,
+    saver: RunSaver | None = None,
 ) -> WindowStore | None:
     """A file for what windows are fused from, under a name for the time being; where it is not
-    wanted, memory if the map `moves`, else None. A recording that is `added` to a map goes on with its
-    file.
+    wanted, None unless the map `moves`, and then memory, if no `saver` needs it in a file. A recording
+    that is `added` to a map goes on with its file, a run that was ended with its own.
     """
     from ..maps.window_store import WindowStore
 
-    if _obstacle(settings):
+    if _obstacle(settings) or (options.forget and not moves):
         return None
-    if options.forget:
-        return WindowStore() if moves else None
+    if saver is not None and saver.resumed is not None and saver.resumed.state.windows is not None:
+        from ..results.safe_windows import windows_then
+
+        return windows_then(folder, saver.resumed.state.windows)
+    if options.forget and (saver is None or not saver.seconds):
+        return WindowStore()
     folder.new_windows.unlink(missing_ok=True)
     if added and added.windows:
         from ..results.merging import continued
@@ -83,13 +91,18 @@ def open_store(
     return WindowStore(folder.new_windows)
 
 
-def keep_store(folder: RunFolder, store: WindowStore | None) -> tuple[Path, ...]:
-    """Give the file of windows its name; the files that are there then."""
+def keep_store(
+    folder: RunFolder, store: WindowStore | None, options: OutputOptions
+) -> tuple[Path, ...]:
+    """Give the file of windows its name, unless it is to be forgotten; the files that are there then."""
     if store is None or store.path is None:
         return ()
     store.sync()
     store.close()
-    folder.new_windows.replace(folder.windows)
+    if options.forget:
+        folder.new_windows.unlink(missing_ok=True)  # what safe points hold is removed with them
+        return ()
+    store.path.replace(folder.windows)
     store.moved_to(folder.windows)
     return (folder.windows,)
 
@@ -112,35 +125,48 @@ def map_in_one_pass(recording: Dataset, made: Run) -> Mapped:
     end with all of it at the final poses.
     """
     from .. import runtime
-    from ..files.trajectories import write_trajectory
-    from ..pipeline import Pipeline
     from ..tracking.online import OnlineFrames
-    from ..tracking.sequence import concluded, say_warnings, write_tracking
+    from ..tracking.sequence import concluded, say_warnings
 
-    options, folder, started = made.options, made.folder, time.perf_counter()
+    options, folder, saver, started = made.options, made.folder, made.saver, time.perf_counter()
     poses, settings = options.poses, options.settings
     watched = options.watch.view or options.watch.view_window
     runtime.init(settings.device, threads=settings.threads or None)
     tracker = _tracker(options)
-    store = open_store(folder, options.output, settings, moves=True)
-    pipeline = Pipeline(settings, encoder=made.encoder, keep=store)
-    if pipeline.follower is not None and not watched:  # nobody sees the map before its end
+    store = open_store(folder, options.output, settings, moves=True, saver=saver)
+    pipeline = make_pipeline(options, made.encoder, folder, saver, store)
+    assert pipeline.follower is not None
+    if not watched:  # nobody sees the map before its end
         pipeline.follower.budget = 0.0
-    frames = OnlineFrames(recording, tracker, options.recording.every, following(pipeline))
+    before = saver.resumed and saver.resumed.so_far
+    frames = OnlineFrames(
+        recording,
+        tracker,
+        options.recording.every,
+        following(pipeline),
+        later=not watched,
+        done=before.done if before else 0,
+        stop=made.stop,
+    )
     logger.info("tracking: %s, in one pass with mapping", poses.mode)
     warnings = say_warnings(frames.frames, tracker)
     strict = options.recording.strict
     run = map_frames(
-        pipeline, frames, len(frames), strict=strict, stop=made.stop, watcher=made.watcher
+        pipeline,
+        frames,
+        len(frames),
+        strict=strict,
+        stop=made.stop,
+        watcher=made.watcher,
+        on_border=saver.at_border,
+        before=before,
     )
     result = concluded(tracker, time.perf_counter() - started, warnings, run.interrupted)
     run = replace(
         run, skipped=tuple(replace(each, index=frames.place_of(each.index)) for each in run.skipped)
     )
     run = settle(pipeline, run, tracker.current_poses())
-    write_tracking(folder.tracking, result)
-    write_trajectory(folder.tracked_poses, result.trajectory)
-    assert pipeline.follower is not None
+    keep_tracking(folder, result)
     details = {
         "mode": poses.mode,
         **result.details,
@@ -149,10 +175,9 @@ def map_in_one_pass(recording: Dataset, made: Run) -> Mapped:
             name: round(value, 4) for name, value in asdict(pipeline.follower.summary()).items()
         },
     }
-    kept = remembered(
-        folder, recording[:: options.recording.every], run, store, None, pipeline.config, made.stop
-    )
-    written = (*folder.tracking_files, *keep_store(folder, store), *kept)
+    every, lasting = options.recording.every, None if options.output.forget else store
+    kept = remembered(folder, recording[::every], run, lasting, None, pipeline.config, made.stop)
+    written = (*folder.tracking_files, *keep_store(folder, store, options.output), *kept)
     return Mapped(pipeline, run, details, written)
 
 
@@ -190,11 +215,13 @@ def settle(pipeline: Pipeline, run: RunResult, poses: CurrentPoses) -> RunResult
         return run
     final = poses.by_frame
     pipeline.follower.follow(final)
-    followed = pipeline.follower.finish(alone=True)
-    if followed.moves or followed.anew:
+    with frame_progress(len(pipeline.follower.store), "window") as on_window:
+        pipeline.follower.on_window = on_window
+        followed = pipeline.follower.finish(alone=True)
+    if followed.moved or followed.moves:
         logger.info(
-            "the map followed: %d of %d windows lie elsewhere than they were fused at first, up to %.1f cm; "
-            "%d moves, %d fused anew, %.1f s",
+            "the map followed: %d of %d windows lie elsewhere than they were tracked at first, up to %.1f cm; "
+            "%d moves, %d fused in the end, %.1f s",
             followed.moved,
             followed.windows,
             100 * followed.farthest,

@@ -59,11 +59,6 @@ def check_into(options: RunOptions, on_workers: bool) -> None:
     known, goes_on = RunFolder(into), output.resume and RunFolder(output.out).placement.exists()
     before = settings_of(into) if goes_on else read_run(into).config()
     _check_tiles(known, options)
-    if output.resume and known.windows.exists() and not (output.forget or _tiled(options)):
-        raise InputError(
-            f"--resume: a run that keeps windows, as those of {known.windows}, cannot go on yet; leave --resume "
-            "out, or let go of them with --forget"
-        )
     for name in SETTINGS:
         if getattr(options.settings, name) != getattr(before, name):
             raise InputError(

@@ -170,7 +170,7 @@ def _map(
     result = tracker.finish()
     run = settle(pipeline, run, tracker.current_poses())
     written = _write_tracking(folder, result) if source.tracking != "given" else ()
-    written = (*written, *keep_store(folder, store))
+    written = (*written, *keep_store(folder, store, output))
     details = {
         **result.details,
         "mode": source.tracking,

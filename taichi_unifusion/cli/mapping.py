@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 from ..datasets import Dataset
 from ..tracking import track
 from ..tracking.sequence import PosedFrames
-from .color_camera import found_color
 from .following import in_one_pass, keep_store, keep_tracking, map_in_one_pass, open_store
-from .into import Addition, maps_of, placed, remembered
+from .into import Addition, placed, remembered
 from .on_workers import run_on_workers
 from .options import source_of
 from .resuming import make_pipeline, registered
@@ -30,10 +29,11 @@ def map_recording(
     options, folder, saver = run.options, run.folder, run.saver
     every, wanted = options.recording.every, options.recording
     if not options.cluster.wanted and in_one_pass(recording, options):
-        recording, color = found_color(recording, color)
-        mapped = map_in_one_pass(recording, run)
+        recording, color = registered(recording, color, saver)
         frames = recording[::every]
-        return mapped, frames, source_of(wanted, len(frames), color)
+        source = source_of(wanted, len(frames), color)
+        saver.describe(source, {"mode": options.poses.mode, "passes": 1})
+        return map_in_one_pass(recording, run), frames, source
     tracking, tracked, written, added = None, None, (), None
     if options.poses.tracked:
         recording, tracking = _track(recording, run)
@@ -75,17 +75,12 @@ def map_recording(
 
 def _map(frames: Dataset, run: Run, added: Addition | None) -> Mapped:
     """Fuse frames at the poses that they have, to maps that are there if they are added to some."""
-    from ..pipeline import Pipeline
-
     options, folder, saver = run.options, run.folder, run.saver
     output, store = options.output, None
     if output.keep_windows or (added and added.windows and not output.forget):
-        store = open_store(folder, output, options.settings, moves=False, added=added)
-    if store is not None:
-        maps = maps_of(options, folder)
-        pipeline = Pipeline(options.settings, encoder=run.encoder, keep=store, maps=maps)
-    else:
-        pipeline = make_pipeline(options, run.encoder, folder, saver)
+        settings = options.settings
+        store = open_store(folder, output, settings, moves=False, added=added, saver=saver)
+    pipeline = make_pipeline(options, run.encoder, folder, saver, store)
     done = map_frames(
         pipeline,
         frames,
@@ -93,11 +88,11 @@ def _map(frames: Dataset, run: Run, added: Addition | None) -> Mapped:
         strict=options.recording.strict,
         stop=run.stop,
         watcher=run.watcher,
-        on_border=saver.at_border if store is None else None,
+        on_border=saver.at_border,
         before=saver.resumed and saver.resumed.so_far,
     )
     kept = remembered(folder, frames, done, store, added, pipeline.config, run.stop)
-    return Mapped(pipeline, done, None, (*keep_store(folder, store), *kept))
+    return Mapped(pipeline, done, None, (*keep_store(folder, store, output), *kept))
 
 
 def _track(recording: Dataset, run: Run) -> tuple[PosedFrames, Mapping[str, Any]]:

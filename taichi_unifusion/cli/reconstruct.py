@@ -99,13 +99,6 @@ def fuse(recording: Dataset, options: Reconstruct, encoder: ImageEncoder | None 
     """
     options = replace(options, poses=options.poses.for_recording(recording))
     check_poses(recording, options.poses.mode, options.poses.trajectory)
-    if options.output.resume and (
-        options.output.keep_windows or options.poses.tracking_passes == 1
-    ):
-        raise InputError(
-            "--resume: a run that keeps windows (--keep-windows, --tracking-passes 1) cannot go on yet; leave "
-            "--resume out"
-        )
     check_into(options, options.cluster.wanted)
     check_workers(options.cluster, options.watch.view or options.watch.view_window)
     recording, color = given_color(recording, options.recording.color_camera)

@@ -14,9 +14,10 @@ from ..results.record import ColorRecord, read_record
 from ..results.run_folder import RunFolder
 from .color_camera import found_color
 from .into import maps_of
-from .options import RunOptions, source_of
+from .options import OutputOptions, RunOptions, source_of
 
 if TYPE_CHECKING:
+    from ..maps.window_store import WindowStore
     from ..networks.encoders import ImageEncoder
     from ..pipeline import Pipeline
     from ..results.saver import RunSaver
@@ -44,6 +45,8 @@ def open_saver(
             "trajectory": str(poses.trajectory or ""),
             "interpolate": poses.interpolate,
             **({"into": str(output.into)} if output.into else {}),
+            **({"passes": 1} if poses.tracked and poses.tracking_passes == 1 else {}),
+            **({"windows": kept} if (kept := _windows(output)) else {}),
         },
         color_camera=options.recording.color_camera,
         features=encoder.name if encoder else "",
@@ -64,6 +67,11 @@ def open_saver(
             "its poses are used, the map begins anew" if saver.tracked else "the run begins anew",
         )
     return saver
+
+
+def _windows(output: OutputOptions) -> str:
+    """What was said of windows: "" for nothing."""
+    return "kept" if output.keep_windows else "forgotten" if output.forget else ""
 
 
 def is_complete(folder: RunFolder, frames: int, options: RunOptions) -> bool:
@@ -87,6 +95,9 @@ def is_complete(folder: RunFolder, frames: int, options: RunOptions) -> bool:
         and into == str(options.output.into or "")
         and settled == used
         and mode == options.poses.mode
+        and not (
+            options.output.keep_windows and folder.relative(folder.windows) not in record.files
+        )
         and not (done.interrupted or record.errors)
         and done.used + done.skipped == frames
     )
@@ -106,10 +117,14 @@ def registered(
 
 
 def make_pipeline(
-    options: RunOptions, encoder: ImageEncoder | None, folder: RunFolder, saver: RunSaver
+    options: RunOptions,
+    encoder: ImageEncoder | None,
+    folder: RunFolder,
+    saver: RunSaver,
+    store: WindowStore | None = None,
 ) -> Pipeline:
     """The pipeline of a run, with the maps of the safe point that it goes on from, or else of the run that
-    it is added to.
+    it is added to. It keeps its windows in a `store`, if there is one.
     """
     from .. import runtime
     from ..pipeline import Pipeline
@@ -118,14 +133,17 @@ def make_pipeline(
     if saver.resumed is None:
         shutil.rmtree(folder.working_tiles, ignore_errors=True)  # of a run that was killed
         maps, tiles = maps_of(options, folder), folder.working_tiles
-        return Pipeline(options.settings, encoder=encoder, maps=maps, tiles=tiles)
+        return Pipeline(options.settings, encoder=encoder, keep=store, maps=maps, tiles=tiles)
     settings = options.settings
     runtime.init(settings.device, threads=settings.threads or None)
     state = saver.resumed.state
     maps = {} if restore_tiles(folder, state) else read_maps(folder, state)
     tiles = folder.working_tiles
-    pipeline = Pipeline(read_settings(folder, state), encoder=encoder, maps=maps, tiles=tiles)
+    settings = read_settings(folder, state)
+    pipeline = Pipeline(settings, encoder=encoder, keep=store, maps=maps, tiles=tiles)
     pipeline.fusion.borders = state.borders
+    if pipeline.follower is not None and state.windows is not None:
+        pipeline.follower.settled = state.windows.settled
     return pipeline
 
 

@@ -14,7 +14,7 @@ import math
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -48,8 +48,8 @@ class Record:
     size: int  # of the body
     checksum: int  # of the body
 
-    def read(self) -> dict[str, NDArray]:
-        """The arrays by name; raises FileError where the file is damaged or gone."""
+    def read(self, names: Collection[str] | None = None) -> dict[str, NDArray]:
+        """The arrays by name, or those of `names`; raises FileError where the file is damaged or gone."""
         try:
             with self.path.open("rb") as file:
                 file.seek(self.offset)
@@ -58,7 +58,7 @@ class Record:
             raise file_error("read", self.path, error) from error
         if len(body) != self.size or zlib.crc32(body) != self.checksum:
             raise damaged(self.path, "a checksum does not fit")
-        return unpack(self.path, self.arrays, body)
+        return unpack(self.path, self.arrays, body, names)
 
 
 def damaged(path: Path, why: str) -> FileError:
@@ -89,16 +89,23 @@ def pack(values: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> bytes:
     return head + header + body
 
 
-def unpack_record(packed: bytes) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Values and arrays that `pack` was given."""
+def unpack_record(
+    packed: bytes, names: Collection[str] | None = None
+) -> tuple[dict[str, Any], dict[str, NDArray]]:
+    """Values and arrays that `pack` was given, or those arrays of `names`."""
     _, length, _, _, _ = _HEAD.unpack_from(packed)
     content = json.loads(packed[_HEAD.size : _HEAD.size + length])
     body = packed[_HEAD.size + length :]
-    return content["values"], unpack(Path("memory"), tuple(content["arrays"]), body)
+    return content["values"], unpack(Path("memory"), tuple(content["arrays"]), body, names)
 
 
-def unpack(path: Path, entries: tuple[Mapping[str, Any], ...], body: bytes) -> dict[str, NDArray]:
-    """The arrays of a body; raises FileError where an entry does not fit it."""
+def unpack(
+    path: Path,
+    entries: tuple[Mapping[str, Any], ...],
+    body: bytes,
+    names: Collection[str] | None = None,
+) -> dict[str, NDArray]:
+    """The arrays of a body, or those of `names`; raises FileError where an entry does not fit it."""
     arrays, at = {}, 0
     for entry in entries:
         size = int(entry["bytes"])
@@ -107,6 +114,9 @@ def unpack(path: Path, entries: tuple[Mapping[str, Any], ...], body: bytes) -> d
             raise damaged(path, f"array '{str(entry.get('name'))[:40]}' of an unknown kind")
         if size < 0 or min(shape, default=0) < 0 or math.prod(shape) > MAX_ELEMENTS:
             raise damaged(path, "an array of no possible size")
+        if names is not None and entry["name"] not in names:
+            at += size
+            continue
         try:
             decode = _CODERS[entry["coding"]][1]
             arrays[str(entry["name"])] = decode(
@@ -188,6 +198,11 @@ class RecordLog:
         content = json.loads(packed[_HEAD.size : _HEAD.size + length])
         at = start + _HEAD.size + length
         return Record(self.path, content["values"], tuple(content["arrays"]), at, size, body_sum)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self._file.tell()
 
     def sync(self) -> None:
         """Wait until all that was appended is on the disk."""

@@ -131,8 +131,12 @@ class FeatureMap(BaseMap[FeatureSettings]):
         """Fuse the features that a frame's patches see into the map, as `integrate` does."""
         return self._integrate(patches, self._features_of(patches.features))
 
-    def integrate_and_keep(self, patches: Patches) -> tuple[Integration, KeptFeatures]:
-        """As `integrate_patches`; also what was fused, by value, which is what is kept of it."""
+    def integrate_and_keep(
+        self, patches: Patches, *, fuse: bool = True
+    ) -> tuple[Integration, KeptFeatures]:
+        """As `integrate_patches`; also what was fused, by value, which is what is kept of it. Without `fuse`
+        it is kept alone.
+        """
         runtime.check_alive(self.grid.runtime)
         binner = self.binner
         opened = binner.touch(binner.open(binner.shared()), patches)
@@ -140,6 +144,8 @@ class FeatureMap(BaseMap[FeatureSettings]):
         cells = KeptCells.of(opened, binner, [])
         kept = KeptFeatures.of(self.name, cells, self._features_of(patches.features))
         binned = binner.close(opened, self.grid.runtime.arena)
+        if not fuse:
+            return Integration(patches.total, 0, len(self)), kept
         return self._fuse(binned, kept.image(), patches.total), kept
 
     def integrate_kept(self, kept: KeptFeatures, T: NDArray[np.float64] | None) -> None:

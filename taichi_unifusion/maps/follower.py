@@ -10,7 +10,7 @@ are quantised: they are fused again.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from ..geometry.se3 import distance
 from .base_map import BaseMap
 from .feature_map import FeatureMap
-from .kept_window import KeptWindow, placed
-from .property_group import MapGroup
+from .kept_window import KeptViews, KeptWindow, placed
+from .property_group import MapGroup, group_maps
 from .surface_map import SurfaceMap
 from .value_scale import steps_for
 from .window import WindowFusion
@@ -42,7 +42,7 @@ class Followed:
     windows: int = 0  # that were kept
     moved: int = 0  # of them, those that do not lie where they were fused first
     moves: int = 0  # how often a window was taken out, put back, or both
-    anew: int = 0  # windows that were fused anew in the end, since most had moved
+    anew: int = 0  # windows that were fused in the end, all of them, since most had moved or waited
     farthest: float = 0.0  # [m] that a window lies from where it was fused first
     seconds: float = 0.0
     settled: float = 0.0  # [s] of them, for votes and features in the end
@@ -56,6 +56,15 @@ class Fusing(Protocol):
 
     @property
     def maps(self) -> dict[str, BaseMap]: ...
+
+
+class GivenMaps:
+    """Maps without what made their values, into which windows are fused."""
+
+    def __init__(self, maps: Iterable[BaseMap]) -> None:
+        self.maps: dict[str, BaseMap] = {each.name: each for each in maps}
+        self.groups: list[MapGroup] = group_maps(self.maps.values())
+        self.fusion = WindowFusion(1)
 
 
 class MapFollower:
@@ -74,7 +83,9 @@ class MapFollower:
         self._wanted: dict[int, Pose | None] = {}  # by number of a window, where that is elsewhere
         self._looked = 0  # windows whose place was compared with the poses
         self._credit, self._price = 0.0, 0.0  # [ms] to spend, and of the last window
-        self._settled = True
+        # told of every window that is fused in the end, and how many there are
+        self.on_window: Callable[[int, int], None] = lambda done, total: None
+        self.settled = True  # False: windows moved since all views voted and features were fused
 
     def follow(self, T_world_camera: Mapping[int, Pose]) -> None:
         """Take note of the poses of all frames so far; frames that are missing have none (any more)."""
@@ -89,7 +100,7 @@ class MapFollower:
         self._fuse(window, T_world_keyframe, 1)
         self.store(window)
         self.store.place({len(self.store) - 1: T_world_keyframe})
-        self._settled = False
+        self.settled = False
 
     def earn(self) -> None:
         """A frame came in: there is more time for windows that move."""
@@ -132,7 +143,7 @@ class MapFollower:
                 self._move(number, self._wanted.pop(number), vote=False)
         self._compact()
         # maps of features have what lies nowhere, too: they take every frame at once
-        if not self._settled or any(kept.place is None for kept in self.store.windows):
+        if not self.settled or any(kept.place is None for kept in self.store.windows):
             self.settle()
         return self.summary()
 
@@ -160,12 +171,12 @@ class MapFollower:
         for each in features:
             each.clear()
         for number in self.store.resident() if surfaces or features else ():
-            self._vote(number, self.store[number], surfaces, features)
+            self._vote(number, surfaces, features)
         spent = time.perf_counter() - started
         self.done = replace(
             self.done, seconds=self.done.seconds + spent, settled=self.done.settled + spent
         )
-        self._settled = True
+        self.settled = True
 
     @property
     def surfaces(self) -> list[SurfaceMap]:
@@ -184,13 +195,16 @@ class MapFollower:
     def _vote(
         self,
         number: int,
-        window: KeptWindow,
         surfaces: Sequence[SurfaceMap],
         features: Sequence[FeatureMap],
     ) -> None:
         place = self.store.windows[number].place
         assert place is not None
-        _let_vote(surfaces, window, place, 1)
+        if not features:  # nothing else is read
+            _let_vote(surfaces, self.store.views(number), place, 1)
+            return
+        window = self.store[number]
+        _let_vote(surfaces, window.views, place, 1)
         motion = window.motion(place)
         for kept in window.features:
             for each in features:
@@ -211,10 +225,13 @@ class MapFollower:
         target = placed(kept.frames, kept.T_keyframe_camera, self._poses)
         if target is None and kept.place is None:
             return
-        if target is not None and kept.place is not None:
-            moved, turned = distance(kept.place, target)
+        if target is not None:
+            at = kept.T_world_keyframe if kept.place is None else kept.place
+            moved, turned = distance(at, target)
             if moved <= LEAST_MOVE and np.degrees(turned) <= LEAST_TURN:
-                return
+                if kept.place is not None:
+                    return
+                target = at  # its cells are those of the map there
         self._wanted[number] = target
 
     def _amount(self, number: int) -> float:
@@ -230,13 +247,17 @@ class MapFollower:
         started = time.perf_counter()
         for each in self.fusing.maps.values():
             each.grid.clear()
+        places: dict[int, Pose | None] = {}
         for number, kept in enumerate(self.store.windows):
-            target, window = self._wanted.pop(number, kept.place), self.store[number]
+            target = self._wanted.pop(number, kept.place)
             if target is not None:
+                window = self.store[number]
                 target = self._at_home(kept, window, target)
                 self._fuse(window, target, 1)
-            self.store.place({number: target})
-        self._settled = False
+            places[number] = target
+            self.on_window(number + 1, len(self.store))
+        self.store.place(places)
+        self.settled = False
         spent = time.perf_counter() - started
         self.done = replace(
             self.done, anew=self.done.anew + len(self.store), seconds=self.done.seconds + spent
@@ -254,13 +275,13 @@ class MapFollower:
         if target is not None:
             target = self._at_home(kept, window, target)
         if kept.place is not None:
-            _let_vote(surfaces, window, kept.place, -1)
+            _let_vote(surfaces, window.views, kept.place, -1)
             self._fuse(window, kept.place, -1)
         if target is not None:
             self._fuse(window, target, 1)
-            _let_vote(surfaces, window, target, 1)
+            _let_vote(surfaces, window.views, target, 1)
         self.store.place({number: target})
-        self._settled = False
+        self.settled = False
         spent = time.perf_counter() - started
         self.done = replace(self.done, moves=self.done.moves + 1, seconds=self.done.seconds + spent)
 
@@ -285,11 +306,11 @@ class MapFollower:
 
 
 def _let_vote(
-    surfaces: Sequence[SurfaceMap], window: KeptWindow, T_world_keyframe: Pose, sign: int
+    surfaces: Sequence[SurfaceMap], views: KeptViews, T_world_keyframe: Pose, sign: int
 ) -> None:
     """Let the views of a window, at a pose, vote on the surface as it is."""
     if surfaces:
-        depth, T = window.views.meters, window.views.T_camera_world(T_world_keyframe)
+        depth, T = views.meters, views.T_camera_world(T_world_keyframe)
         for surface in surfaces:
             if surface.grid.count:
-                surface.vote(depth, window.views.camera, T, (0, surface.grid.count), sign)
+                surface.vote(depth, views.camera, T, (0, surface.grid.count), sign)

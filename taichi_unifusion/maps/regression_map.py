@@ -5,7 +5,7 @@ frame (Fig. 5).
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from .base_map import BaseMap, Integration, S, check_cloud
 from .binner import Binner
 from .encoder import Decoder, Encoder
 from .local_lim import LocalLim
-from .voxel_data import VoxelData, VoxelField, regression_fields
+from .voxel_data import KEYS, VoxelData, VoxelField, regression_fields
 from .voxel_grid import VoxelGrid
 
 # What is fused exactly is rounded to steps of one part in this: sums in float64 are exact to 5e8.
@@ -73,6 +73,29 @@ class RegressionGrid(VoxelGrid):
         for each in counted:
             words = self[each.replace("supported", "masks")].to_numpy().astype(">u4").view(np.uint8)
             self[each].from_numpy(np.unpackbits(words, axis=1).astype(np.uint16))
+
+    def exact_sums(self) -> dict[str, NDArray]:
+        """What `sum_exactly` keeps, which no file of the map holds: by name, of the voxels (N, ...) in the
+        order of `export`.
+        """
+        slots = self.sorted_slots()
+        return {
+            name: pool.take(slots)
+            for name, pool in self._pools.items()
+            if pool.field not in (KEYS, *self.fields)
+        }
+
+    def restore_sums(self, steps: float, sums: Mapping[str, NDArray]) -> None:
+        """Go on with the `exact_sums` of the voxels that were added to an empty grid; raises ValueError where
+        they do not fit.
+        """
+        self.sum_exactly(steps)
+        slots = np.arange(self.count, dtype=np.int32)
+        for name, rows in sums.items():
+            pool = self._pools.get(name)
+            if pool is None or rows.shape != (self.count, *pool.field.shape):
+                raise ValueError(f"sums '{name}' of {rows.shape} do not fit the map")
+            pool.put(slots, rows.astype(pool.field.dtype, copy=False))
 
     def _totals(self, weights: NDArray[np.float32], name: str) -> NDArray[np.float64]:
         """(S, 1 + r c) sums of w (S,) and F w, to steps."""

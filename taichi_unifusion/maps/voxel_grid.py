@@ -255,10 +255,14 @@ class VoxelGrid:
         """(N, 3) voxel indices, in no order."""
         return self._pools[KEYS.name].take(self.used_slots())
 
+    def sorted_slots(self) -> NDArray[np.int32]:
+        """Slots that hold a voxel, sorted by its index (i, then j, then k)."""
+        return self.used_slots()[np.lexsort(self.voxel_keys().T[::-1])]
+
     def export(self) -> VoxelData:
         """All voxels by value."""
         runtime.check_alive(self.runtime)
-        return self.take(self.used_slots()[np.lexsort(self.voxel_keys().T[::-1])])
+        return self.take(self.sorted_slots())
 
     def add(self, data: VoxelData) -> None:
         """Add voxels, none of which is there, exactly as they are; raises CapacityError."""

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError
+from ..files.atomic import file_error
 from ..files.record_file import Record, RecordLog, pack, scan, unpack_record
 from ..types import PinholeCamera
 from .kept_cells import KeptCells, Levels
 from .kept_window import KeptFeatures, KeptViews, KeptWindow
 
 WINDOW, POSES = "window", "poses"  # kinds of records
+DEPTH = "depth"  # the array of a record with the images of the views
 WAITING = 8  # windows at most that wait to be compressed
 
 
@@ -91,6 +93,14 @@ class WindowStore:
         assert kept.packed is not None
         return from_record(*unpack_record(kept.packed.result()))
 
+    def views(self, number: int) -> KeptViews:
+        """The depth images of a window alone; raises as reading all of it."""
+        kept = self.windows[number]
+        if kept.record is not None:
+            return _views(kept.record.values, kept.record.read((DEPTH,)))
+        assert kept.packed is not None
+        return _views(*unpack_record(kept.packed.result(), (DEPTH,)))
+
     def place(self, places: Mapping[int, NDArray[np.float64] | None]) -> None:
         """Note where windows lie now, by number; None: they were taken out."""
         for number, T in places.items():
@@ -130,6 +140,25 @@ class WindowStore:
             self._log.close()
             self._log = None
 
+    @property
+    def file_size(self) -> int:
+        """Bytes of the file, which is open."""
+        return self._log.size if self._log is not None else 0
+
+    def move(self, path: Path) -> None:
+        """Go on in the same file at another place, on the same disk; raises FileError."""
+        self.sync()
+        if self._log is None or self.path is None:
+            return
+        self._log.close()
+        try:
+            self.path.replace(path)
+        except OSError as error:
+            self._log = RecordLog(self.path)
+            raise file_error("write", path, error) from error
+        self._log = RecordLog(path)
+        self.moved_to(path)
+
     def moved_to(self, path: Path) -> None:
         """Note that the file, which is closed, has another name now."""
         self.path = path
@@ -163,7 +192,10 @@ class WindowStore:
                 self.windows.append(Kept(frames, T, views, place, None, record, size))
             elif values["kind"] == POSES:
                 for number, T in values["places"].items():
-                    self.windows[int(number)].place = None if T is None else _pose(T)
+                    kept = self.windows[int(number)]
+                    at = None if T is None else _pose(T)
+                    home = at is not None and np.array_equal(at, kept.T_world_keyframe)
+                    kept.place = kept.T_world_keyframe if home else at
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise FileError(f"{record.path}: damaged ({error}); make the results again") from None
 
@@ -174,7 +206,7 @@ def _pose(values: Any) -> NDArray[np.float64]:
 
 def to_record(window: KeptWindow) -> tuple[dict[str, Any], dict[str, NDArray]]:
     """A window as JSON values and arrays."""
-    arrays: dict[str, NDArray] = {"depth": window.views.depth}
+    arrays: dict[str, NDArray] = {DEPTH: window.views.depth}
     parts = [
         _put_cells(f"part{i}", names, cells, arrays)
         for i, (names, cells) in enumerate(window.cells.items())
@@ -205,14 +237,6 @@ def to_record(window: KeptWindow) -> tuple[dict[str, Any], dict[str, NDArray]]:
 
 def from_record(values: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> KeptWindow:
     """The window that `to_record` gave."""
-    T_keyframe_camera = np.array(values["T_keyframe_camera"], np.float64).reshape(-1, 4, 4)
-    same = [[1.0, 1.0, 0.0, 0.0]] * len(T_keyframe_camera)  # results of before have one lens
-    views = KeptViews(
-        arrays["depth"],
-        PinholeCamera(*values["camera"]),
-        T_keyframe_camera,
-        np.array(values.get("lenses", same), np.float64).reshape(-1, 4),
-    )
     cells = {
         tuple(part["names"]): _get_cells(f"part{i}", part, arrays)
         for i, part in enumerate(values["parts"])
@@ -229,7 +253,19 @@ def from_record(values: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> Kep
         for i, each in enumerate(values["features"])
     ]
     frames, T = tuple(values["frames"]), _pose(values["T_world_keyframe"])
+    views = _views(values, arrays)
     return KeptWindow(frames, T, cells, views, features, bool(values.get("apart")))
+
+
+def _views(values: Mapping[str, Any], arrays: Mapping[str, NDArray]) -> KeptViews:
+    T_keyframe_camera = np.array(values["T_keyframe_camera"], np.float64).reshape(-1, 4, 4)
+    same = [[1.0, 1.0, 0.0, 0.0]] * len(T_keyframe_camera)  # results of before have one lens
+    return KeptViews(
+        arrays[DEPTH],
+        PinholeCamera(*values["camera"]),
+        T_keyframe_camera,
+        np.array(values.get("lenses", same), np.float64).reshape(-1, 4),
+    )
 
 
 def _camera_values(camera: PinholeCamera) -> list[float]:

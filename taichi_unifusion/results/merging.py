@@ -16,7 +16,8 @@ from ..config import Config
 from ..errors import FileError, InputError
 from ..files.tiles import map_bytes
 from ..geometry import se3
-from ..maps.follower import MapFollower
+from ..maps import load_map
+from ..maps.follower import GivenMaps, MapFollower
 from ..maps.window_store import WindowStore
 from ..tracking.joining import Joined, join
 from ..tracking.keyframe_file import write_keyframes
@@ -24,7 +25,7 @@ from ..tracking.keyframes import Keyframes
 from .keyframes import known_keyframes
 from .reader import read_run
 from .record import MapRecord, read_record, write_record
-from .reposing import Refusing, read_windows
+from .reposing import read_windows
 from .run_folder import RunFolder
 
 SETTINGS = ("voxel_size", "surface", "color", "property_map", "feature_map", "properties")
@@ -61,12 +62,13 @@ def check_same_maps(folders: list[RunFolder]) -> Config:
 
 def align(
     folders: list[RunFolder], out: RunFolder, config: Config
-) -> tuple[Refusing, list[Aligned]]:
+) -> tuple[GivenMaps, list[Aligned]]:
     """The maps of all runs in the world of the first; windows and keyframes are kept in `out`, under
     names for the time being. Raises NoOverlap where a camera does not find its place.
     """
     kept = [read_windows(folder) for folder in folders]
-    maps, store = Refusing(folders[0], empty=False), continued(folders[0].windows, out)
+    maps = GivenMaps(load_map(path) for path in folders[0].maps.values())
+    store = continued(folders[0].windows, out)
     follower, known, added = MapFollower(maps, store), known_keyframes(folders[0]), []
     for folder, windows in zip(folders[1:], kept[1:], strict=True):
         new = known_keyframes(folder)
@@ -87,7 +89,7 @@ def align(
 
 
 def record_all(
-    folders: list[RunFolder], out: RunFolder, maps: Refusing, added: list[Aligned]
+    folders: list[RunFolder], out: RunFolder, maps: GivenMaps, added: list[Aligned]
 ) -> None:
     """Write the record of the merged map: that of the first run, with the others' recordings."""
     record = read_record(out.record)

@@ -15,11 +15,9 @@ from ..errors import FileError, InputError
 from ..evaluation.trajectory import align_poses
 from ..geometry.se3 import distance, inverse, normalized
 from ..geometry.time_stamps import nearest
-from ..maps import BaseMap, load_map
-from ..maps.follower import MapFollower
+from ..maps import load_map
+from ..maps.follower import GivenMaps, MapFollower
 from ..maps.kept_window import placed
-from ..maps.property_group import MapGroup, group_maps
-from ..maps.window import WindowFusion
 from ..maps.window_store import WindowStore
 from ..tracking.trajectory_files import read_poses
 from ..types import Trajectory
@@ -49,20 +47,6 @@ class Reposed:
     moved: int  # by more than the least that counts
     farthest: float  # [m]
     median: float  # [m]
-
-
-class Refusing:
-    """Maps of a run, without what made their values, `empty` or as they are: windows are fused into
-    them.
-    """
-
-    def __init__(self, folder: RunFolder, *, empty: bool = True) -> None:
-        loaded = [load_map(path) for path in folder.maps.values()]
-        self.maps: dict[str, BaseMap] = {
-            each.name: each.emptied() if empty else each for each in loaded
-        }
-        self.groups: list[MapGroup] = group_maps(self.maps.values())
-        self.fusion = WindowFusion(1)
 
 
 def read_windows(folder: RunFolder) -> WindowStore:
@@ -131,12 +115,13 @@ def record_reposed(folder: RunFolder, poses: NewPoses) -> None:
     )
 
 
-def repose(folder: RunFolder, windows: WindowStore, poses: NewPoses) -> tuple[Refusing, Reposed]:
+def repose(folder: RunFolder, windows: WindowStore, poses: NewPoses) -> tuple[GivenMaps, Reposed]:
     """The maps of a run with all windows at new poses; what they are fused from is kept in
     `folder.new_windows`.
     """
     folder.new_windows.unlink(missing_ok=True)
-    maps, store = Refusing(folder), WindowStore(folder.new_windows)
+    maps = GivenMaps(load_map(path).emptied() for path in folder.maps.values())
+    store = WindowStore(folder.new_windows)
     follower, moves = MapFollower(maps, store), []
     for number in windows.resident():
         kept = windows.windows[number]

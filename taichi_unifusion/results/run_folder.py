@@ -221,6 +221,11 @@ class RunFolder:
         """The keyframes of both."""
         return self.unfinished / self.keyframes.name
 
+    @property
+    def safe_windows(self) -> Path:
+        """What the windows of a safe point were fused from, and of windows after it."""
+        return self.unfinished / self.windows.name
+
     def generation(self, number: int) -> Path:
         """Where the maps of a safe point lie."""
         return self.unfinished / f"generation-{number}"
@@ -244,6 +249,10 @@ class RunFolder:
     def map_in(self, generation: Path, name: str) -> Path:
         """A map of a safe point in one file."""
         return generation / self.map(name).name
+
+    def sums_in(self, generation: Path, name: str) -> Path:
+        """What a map of a safe point that can follow a loop holds and its file does not."""
+        return generation / f"{name}.sums"
 
     def tiles_in(self, generation: Path, name: str) -> Path:
         """A map of a safe point in tiles."""

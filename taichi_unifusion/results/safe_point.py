@@ -6,6 +6,7 @@ They lie in a folder of their own inside the results folder:
     generation-N/           the maps between two windows, when all frames so far are in them, and the
                             settings with what was chosen by the first frames
     steps.jsonl             a line a frame, appended; `journal_bytes` of the state are valid
+    windows.log             what maps that can follow a loop were fused from; generation-N/*.sums: exact sums
     tracking.json           the poses that a tracker found, once it was through
     placement.json          where a recording lies in the map that it is added to; keyframes.log: of both
 
@@ -40,6 +41,7 @@ from ..tracking import TrackedFrame, TrackingResult, Verdict
 from ..types import Mesh
 from .record import Source, decoded
 from .run_folder import RunFolder
+from .safe_windows import StoredWindows, fuse_waiting, restore_sums
 from .tiled import open_memory
 
 logger = logging.getLogger(__name__)
@@ -79,6 +81,7 @@ class State:
     poses_judged: bool
     doubts: tuple[str, ...]
     readings: tuple[int, ...]
+    windows: StoredWindows | None = None  # of a run that keeps them
 
 
 def read_state(folder: RunFolder) -> State | None:
@@ -108,7 +111,9 @@ def read_state(folder: RunFolder) -> State | None:
 def read_maps(folder: RunFolder, state: State) -> dict[str, BaseMap]:
     """The maps of a safe point; Taichi must run. Raises FileError, MapCorrupt."""
     there = folder.generation(state.generation)
-    return {name: load_map(folder.map_in(there, name)) for name in state.maps}
+    maps = {name: load_map(folder.map_in(there, name)) for name in state.maps}
+    restore_sums(folder, there, maps)
+    return maps
 
 
 def restore_tiles(folder: RunFolder, state: State) -> bool:
@@ -231,6 +236,8 @@ def mesh_of_safe_point(folder: RunFolder) -> Mesh | None:
     if (memory := open_memory(paths)) is not None:
         return joined_mesh(memory, config.mesh.resolution, config.mesh.min_area)
     maps = read_maps(folder, state)
+    if state.windows is not None:
+        fuse_waiting(folder, maps)
     surface = maps["surface"]
     assert isinstance(surface, SurfaceMap)
     shown = {name: each for name, each in maps.items() if isinstance(each, PropertyMap)}
@@ -271,23 +278,23 @@ def _shown(value: Any) -> str:
     return "not given" if value in (None, "") else str(value)[:80]
 
 
-def remove_safe_point(folder: RunFolder) -> None:
-    """Remove what safe points left, and nothing else."""
+def remove_safe_point(folder: RunFolder, but: Path | None = None) -> None:
+    """Remove what safe points left, and nothing else; one unfinished file may be left out."""
     with suppress(OSError):
         folder.state.unlink()
     keep_generation(folder, None)
     own = (folder.journal, folder.tracking_state, folder.placement, folder.placed_keyframes)
-    for file in own:
+    for file in (*own, folder.safe_windows):
         with suppress(OSError):
             file.unlink()
-    remove_temporaries(folder)
+    remove_temporaries(folder, but)
     with suppress(OSError):
         folder.unfinished.rmdir()
 
 
-def remove_temporaries(folder: RunFolder) -> None:
-    """Remove the unfinished files that a process leaves which is ended at once."""
-    for path in folder.temporaries:
+def remove_temporaries(folder: RunFolder, but: Path | None = None) -> None:
+    """Remove the unfinished files that a process leaves which is ended at once, `but` one."""
+    for path in {*folder.temporaries} - {but}:
         with suppress(OSError):
             path.unlink()
 

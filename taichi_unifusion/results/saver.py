@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from .safe_point import (
     write_state,
     write_tracking_state,
 )
+from .safe_windows import keep_windows, save_sums
 
 logger = logging.getLogger(__name__)
 
@@ -104,7 +105,7 @@ class RunSaver:
     def _begin(self) -> None:
         """Remove what another run left, before the first of this one is written."""
         if self.fresh:
-            remove_safe_point(self.folder)
+            remove_safe_point(self.folder, but=self.folder.new_windows)  # this run writes it
             self.fresh = False
         try:
             self.folder.unfinished.mkdir(parents=True, exist_ok=True)
@@ -136,10 +137,12 @@ class RunSaver:
         except OSError as error:
             raise file_error("write", there, error) from error
         self._save_maps(there, pipeline)
+        windows = pipeline.follower and keep_windows(folder, pipeline.follower)
         write_text(folder.config_in(there), dump_config(pipeline.config))
         lines = "".join(f"{line}\n" for line in lines_of(so_far, self.steps, self.skipped))
         size = append(folder.journal, self.bytes, lines)
-        write_state(folder, self._state(so_far, pipeline, generation, size))
+        state = self._state(so_far, pipeline, generation, size)
+        write_state(folder, replace(state, windows=windows))
         self.generation, self.bytes, self.done = generation, size, so_far.done
         self.steps, self.skipped = len(so_far.steps), len(so_far.skipped)
         keep_generation(folder, generation)
@@ -148,6 +151,7 @@ class RunSaver:
         if pipeline.memory is None:
             for name, each in pipeline.maps.items():
                 each.save(self.folder.map_in(there, name))
+            save_sums(self.folder, there, pipeline.maps)
             return
         pipeline.memory.save()
         for name, each in pipeline.memory.sets.items():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from taichi_unifusion.cli import viewing
 from taichi_unifusion.cli.main import main
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.files.mesh_reading import read_mesh
@@ -23,6 +24,8 @@ from taichi_unifusion.results import read_record
 from taichi_unifusion.results.folder_writer import FolderWriter
 from taichi_unifusion.results.run_folder import RunFolder
 from taichi_unifusion.tracking.keyframe_file import read_keyframes
+from taichi_unifusion.viewer.live import ChangedChunks
+from taichi_unifusion.viewer.null import NullViewer
 
 ROOM = ["synthetic", "--option", "frames=120", "--option", "width=240", "--option", "height=180"]
 SMALL = ["--voxel-size", "0.1", "--window", "4", "--device", "cpu", "--color-camera", "none"]
@@ -156,7 +159,6 @@ def test_a_recording_of_another_place_leaves_the_map_as_it_is(monday, capsys):
     ("words", "message"),
     [
         (["--voxel-size", "0.2"], "'voxel_size' is another one"),
-        (["--resume"], "let go of them with --forget"),
         (["--live"], "--live"),
         (["--workers", "2"], "--workers"),
     ],
@@ -249,3 +251,19 @@ def test_maps_in_tiles_are_added_to(monday, grown, tmp_path, monkeypatch):
     assert reconstruct(*words, "--resume", **THIRD) == 0
     assert voxels(tiled) == voxels(again) != voxels(grown)
     assert main(["info", str(tiled)]) == 0
+
+
+def test_who_watches_sees_the_map_that_is_added_to(monday, tmp_path, monkeypatch):
+    shown: dict = {}
+
+    class Looking(NullViewer):
+        def on_step(self, frame, step, pipeline):
+            if not shown:
+                shown.update(ChangedChunks().take(pipeline, frame, 10_000))
+
+    monkeypatch.setattr(viewing, "open_watcher", lambda *_: Looking())
+    words = ["--into", str(monday), "--out", str(tmp_path / "results")]
+    assert reconstruct(*words, **SECOND) == 0
+    seen = np.concatenate([mesh.vertices for mesh in shown.values() if len(mesh.faces)])
+    before = read_mesh(monday / "mesh.ply").vertices
+    assert np.quantile(cKDTree(seen).query(before)[0], 0.9) < 0.1
