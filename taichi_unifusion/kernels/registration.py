@@ -11,6 +11,7 @@ import taichi as ti
 
 from .arrays import Bytes2, Bytes3, Floats2, Floats3
 from .camera import Intrinsics, Pose, lift, project
+from .images import segment, segments
 
 # of a surfel image; 8 numbers fill half a cache line
 DEPTH, NORMAL, INTENSITY, SLOPE_U, SLOPE_V, CHANNELS = 0, 1, 4, 5, 6, 8
@@ -39,40 +40,50 @@ NEAR = 0.05  # [m] points nearer to the target camera are not projected
 def average_inverse_depth(
     # in:
     inverse: Floats2,  # (H, W) [1/m], 0: none
-    factor: ti.i32,
+    factor: ti.template(),
     jump: ti.f32,  # readings that differ by less than this share lie on one surface
     # out:
     # (H / factor, W / factor) mean over the nearest surface of a block, 0 where it fills less than
     # half
     averaged: Floats2,
 ):
-    for v, u in averaged:
-        nearest = 0.0
-        for i, j in ti.ndrange(factor, factor):
-            nearest = ti.max(nearest, inverse[v * factor + i, u * factor + j])
-        total, count = 0.0, 0
-        for i, j in ti.ndrange(factor, factor):
-            q = inverse[v * factor + i, u * factor + j]
-            if q > 0 and nearest - q <= jump * nearest:
-                total += q
-                count += 1
-        averaged[v, u] = total / count if count > 0 and 2 * count >= factor * factor else 0.0
+    height, width = averaged.shape[0], averaged.shape[1]
+    for part in range(height * segments(width)):
+        v, first, end = segment(part, width)
+        for u in range(first, end):
+            nearest = 0.0
+            for i in ti.static(range(factor)):
+                for j in ti.static(range(factor)):
+                    nearest = ti.max(nearest, inverse[v * factor + i, u * factor + j])
+            total, count = 0.0, 0
+            for i in ti.static(range(factor)):
+                for j in ti.static(range(factor)):
+                    q = inverse[v * factor + i, u * factor + j]
+                    if q > 0 and nearest - q <= jump * nearest:
+                        total += q
+                        count += 1
+            averaged[v, u] = total / count if count > 0 and 2 * count >= factor * factor else 0.0
 
 
 @ti.kernel
 def average_color(
     # in:
     color: Bytes3,  # (H, W, 3) RGB
-    factor: ti.i32,
+    factor: ti.template(),
     # out:
     intensity: Floats2,  # (H / factor, W / factor) in [0, 1], Rec. 601 luma
 ):
-    for v, u in intensity:
-        total = 0.0
-        for i, j in ti.ndrange(factor, factor):
-            y, x = v * factor + i, u * factor + j
-            total += 0.299 * color[y, x, 0] + 0.587 * color[y, x, 1] + 0.114 * color[y, x, 2]
-        intensity[v, u] = total / (255.0 * factor * factor)
+    height, width = intensity.shape[0], intensity.shape[1]
+    for part in range(height * segments(width)):
+        v, first, end = segment(part, width)
+        for u in range(first, end):
+            total = 0.0
+            for i in ti.static(range(factor)):
+                for j in ti.static(range(factor)):
+                    y, x = v * factor + i, u * factor + j
+                    light = 0.299 * color[y, x, 0] + 0.587 * color[y, x, 1]
+                    total += light + 0.114 * color[y, x, 2]
+            intensity[v, u] = total / (255.0 * factor * factor)
 
 
 @ti.kernel
@@ -82,13 +93,16 @@ def average_intensity(
     # out:
     averaged: Floats2,  # (H / 2, W / 2)
 ):
-    for v, u in averaged:
-        averaged[v, u] = 0.25 * (
-            intensity[2 * v, 2 * u]
-            + intensity[2 * v, 2 * u + 1]
-            + intensity[2 * v + 1, 2 * u]
-            + intensity[2 * v + 1, 2 * u + 1]
-        )
+    height, width = averaged.shape[0], averaged.shape[1]
+    for part in range(height * segments(width)):
+        v, first, end = segment(part, width)
+        for u in range(first, end):
+            averaged[v, u] = 0.25 * (
+                intensity[2 * v, 2 * u]
+                + intensity[2 * v, 2 * u + 1]
+                + intensity[2 * v + 1, 2 * u]
+                + intensity[2 * v + 1, 2 * u + 1]
+            )
 
 
 @ti.func
@@ -112,18 +126,21 @@ def pack_surfels(
     # out:
     surfels: Floats3,  # (H, W, CHANNELS) depth 0 where there is no reading or no normal
 ):
-    for v, u in inverse:
-        q = inverse[v, u]
-        surfels[v, u, DEPTH] = 1.0 / q if q > 0 and normals[v, u, 2] != 0 else 0.0
-        for d in ti.static(range(3)):
-            surfels[v, u, NORMAL + d] = normals[v, u, d]
-        along_u, along_v = sobel(intensity, v, u)
-        surfels[v, u, INTENSITY], surfels[v, u, SLOPE_U], surfels[v, u, SLOPE_V] = (
-            intensity[v, u],
-            along_u,
-            along_v,
-        )
-        surfels[v, u, CHANNELS - 1] = 0.0
+    height, width = inverse.shape[0], inverse.shape[1]
+    for part in range(height * segments(width)):
+        v, first, end = segment(part, width)
+        for u in range(first, end):
+            q = inverse[v, u]
+            surfels[v, u, DEPTH] = 1.0 / q if q > 0 and normals[v, u, 2] != 0 else 0.0
+            for d in ti.static(range(3)):
+                surfels[v, u, NORMAL + d] = normals[v, u, d]
+            along_u, along_v = sobel(intensity, v, u)
+            surfels[v, u, INTENSITY], surfels[v, u, SLOPE_U], surfels[v, u, SLOPE_V] = (
+                intensity[v, u],
+                along_u,
+                along_v,
+            )
+            surfels[v, u, CHANNELS - 1] = 0.0
 
 
 @ti.func
@@ -284,10 +301,13 @@ def leave_out(
     # in and out:
     surfels: Floats3,  # (H, W, CHANNELS) a depth below 0 is one that is left out
 ):
-    for v, u in ti.ndrange(surfels.shape[0], surfels.shape[1]):
-        i, j = v * moving.shape[0] // surfels.shape[0], u * moving.shape[1] // surfels.shape[1]
-        depth = ti.abs(surfels[v, u, DEPTH])
-        surfels[v, u, DEPTH] = -depth if moving[i, j] != 0 else depth
+    height, width = surfels.shape[0], surfels.shape[1]
+    for part in range(height * segments(width)):
+        v, first, end = segment(part, width)
+        for u in range(first, end):
+            i, j = v * moving.shape[0] // height, u * moving.shape[1] // width
+            depth = ti.abs(surfels[v, u, DEPTH])
+            surfels[v, u, DEPTH] = -depth if moving[i, j] != 0 else depth
 
 
 @ti.func
@@ -338,7 +358,10 @@ def compare_surfels(
     compared: Floats3,  # (h / step, w / step, COMPARED) as `compare_pixel` says
 ):
     R, t = T_target_source[:3, :3], T_target_source[:, 3]
-    for v, u in ti.ndrange(compared.shape[0], compared.shape[1]):
-        found = compare_pixel(source, v * step, u * step, target, K_source, K_target, R, t)
-        for k in ti.static(range(COMPARED)):
-            compared[v, u, k] = found[k]
+    height, width = compared.shape[0], compared.shape[1]
+    for part in range(height * segments(width)):
+        v, first, end = segment(part, width)
+        for u in range(first, end):
+            found = compare_pixel(source, v * step, u * step, target, K_source, K_target, R, t)
+            for k in ti.static(range(COMPARED)):
+                compared[v, u, k] = found[k]

@@ -40,12 +40,13 @@ class SurfelImage:
     camera: PinholeCamera
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SurfelPyramid:
     """A frame as surfel images, finest first, each half the size of the one before."""
 
     levels: tuple[SurfelImage, ...]
     colored: bool = True  # whether intensities may be compared
+    left_out: bool = False  # whether some of its pixels are
 
 
 def reduce_frame(frame: Frame, depth_min: float, depth_max: float) -> ReducedFrame:

@@ -86,14 +86,19 @@ def leave_out(pyramid: SurfelPyramid, moving: NDArray[np.uint8]) -> None:
     """Leave out the pixels of a mask, of any size, and take all others in again."""
     from ..kernels import registration as kernels
 
-    for level in pyramid.levels:
-        kernels.leave_out(moving, level.surfels)
+    some = bool(moving.any())
+    if some or pyramid.left_out:
+        for level in pyramid.levels:
+            kernels.leave_out(moving, level.surfels)
+    pyramid.left_out = some
 
 
 def without_left_out(reduced: ReducedFrame, pyramid: SurfelPyramid) -> ReducedFrame:
     """The images from which that pyramid can be built again."""
     from ..kernels import registration as kernels
 
+    if not pyramid.left_out:
+        return reduced
     left_out = pyramid.levels[0].surfels.to_numpy()[..., kernels.DEPTH] < 0
     if not left_out.any():
         return reduced
