@@ -310,6 +310,22 @@ def leave_out(
             surfels[v, u, DEPTH] = -depth if moving[i, j] != 0 else depth
 
 
+@ti.kernel
+def read_surfels(
+    # in:
+    surfels: Floats3,  # (H, W, CHANNELS)
+    step: ti.i32,  # every step-th pixel of every step-th row is read
+    # out:
+    read: Floats3,  # (H / step, W / step, c) the first c channels, copied
+):
+    height, width = read.shape[0], read.shape[1]
+    for part in range(height * segments(width)):
+        v, first, end = segment(part, width)
+        for u in range(first, end):
+            for k in range(read.shape[2]):
+                read[v, u, k] = surfels[v * step, u * step, k]
+
+
 @ti.func
 def compare_pixel(
     source: ti.template(),

@@ -168,7 +168,7 @@ def _surfels(
     """Rows, columns, depths and normals of the surfels that are not left out."""
     from ..kernels import registration as kernels
 
-    values = image.surfels.to_numpy()[::step, ::step]
+    values = image.read(step, kernels.NORMAL + 3)
     v, u = np.nonzero(values[..., kernels.DEPTH] > 0)
     chosen = values[v, u].astype(np.float64)
     return (

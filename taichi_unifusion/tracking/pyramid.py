@@ -39,6 +39,15 @@ class SurfelImage:
     surfels: DeviceArray
     camera: PinholeCamera
 
+    def read(self, step: int, channels: int) -> NDArray[np.float32]:
+        """(h / step, w / step, channels) the first channels of every step-th pixel and row, by value."""
+        from ..kernels import registration as kernels
+
+        height, width = self.surfels.shape[:2]
+        found = np.empty((-(-height // step), -(-width // step), channels), np.float32)
+        kernels.read_surfels(self.surfels, step, found)
+        return found
+
 
 @dataclass(eq=False)
 class SurfelPyramid:

@@ -95,11 +95,9 @@ def leave_out(pyramid: SurfelPyramid, moving: NDArray[np.uint8]) -> None:
 
 def without_left_out(reduced: ReducedFrame, pyramid: SurfelPyramid) -> ReducedFrame:
     """The images from which that pyramid can be built again."""
-    from ..kernels import registration as kernels
-
     if not pyramid.left_out:
         return reduced
-    left_out = pyramid.levels[0].surfels.to_numpy()[..., kernels.DEPTH] < 0
+    left_out = pyramid.levels[0].read(1, 1)[..., 0] < 0
     if not left_out.any():
         return reduced
     return replace(reduced, inverse=np.where(left_out, np.float32(0), reduced.inverse))
@@ -150,11 +148,9 @@ def _whole_patches(
     """Patches of neighbouring points (k-means in space) of which much is `moving`: the inside of a
     smooth thing that moves contradicts nothing.
     """
-    from ..kernels import registration as kernels
-
     image = source.levels[0]
     apart = STEP * SPARSE
-    depth = np.abs(image.surfels.to_numpy()[::apart, ::apart, kernels.DEPTH])
+    depth = np.abs(image.read(apart, 1)[..., 0])
     (height, width), known = depth.shape, depth > 0
     if known.sum() < LEAST_POINTS:
         return np.zeros_like(moving)

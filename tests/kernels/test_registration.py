@@ -154,6 +154,15 @@ def test_leave_out():
     np.testing.assert_array_equal(changed, packed)
 
 
+@pytest.mark.parametrize(("step", "channels"), [(1, 1), (3, 4), (2, kernels.CHANNELS)])
+def test_read_surfels(step, channels):
+    packed = surfels(3)
+    expected = reference.read_surfels(packed, step, channels)
+    read = np.full(expected.shape, np.nan, np.float32)
+    kernels.read_surfels(packed, step, read)
+    np.testing.assert_array_equal(read, expected)
+
+
 @pytest.mark.parametrize("step", [1, 2])
 def test_compare_surfels(step):
     source, target = surfels(8), surfels(9, 14, 18)

@@ -124,6 +124,11 @@ def leave_out(moving, surfels):
     return kept
 
 
+def read_surfels(surfels, step, channels):
+    """The first channels of every step-th pixel and row."""
+    return surfels[::step, ::step, :channels]
+
+
 def compare_surfels(source, target, K_source, K_target, T, step):
     """(h / step, w / step, 3): how far in front [standard deviations], how much darker, slope."""
     height, width = (-(-n // step) for n in source.shape[:2])
