@@ -19,7 +19,7 @@ from taichi_unifusion.pipeline import Pipeline
 from taichi_unifusion.results import RunFolder, safe_windows, saver
 from taichi_unifusion.results.folder_writer import FolderWriter
 from taichi_unifusion.results.record import read_record
-from taichi_unifusion.results.safe_point import read_state
+from taichi_unifusion.results.safe_point import mesh_of_safe_point, read_state
 
 ROOM = ["--option", "frames=60", "--option", "width=160", "--option", "height=120", "--end", "11"]
 SMALL = [*FLAGS, "--window", "3", "--mesh.resolution", "2", "--mesh.formats", "ply"]
@@ -96,6 +96,7 @@ def test_R7_a_run_that_keeps_windows_goes_on_after_every_death(
     killed(monkeypatch, Pipeline, "step", 6, out.path, *words)
     state = read_state(out)
     assert state.done == 3 and out.safe_windows.stat().st_size >= state.windows.bytes > 1e4
+    assert len(mesh_of_safe_point(out).faces) > 100  # of windows that wait, too
     with out.safe_windows.open("ab") as file:
         file.write(b"half of a window")
     killed(monkeypatch, saver, "write_state", 2, out.path, *words, "--resume")
