@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import runtime
+from .device_arrays import DeviceArray
 from .errors import InputError, check_kind, check_types, strict
-from .runtime import DeviceArray
 from .types import Frame, ImageView, PointCloud
 
 if TYPE_CHECKING:

@@ -18,9 +18,8 @@ import sys
 import textwrap
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from io import StringIO
@@ -29,6 +28,7 @@ from types import FrameType, SimpleNamespace
 from typing import Any
 from weakref import WeakSet
 
+from .device_arrays import Arena
 from .errors import (
     CapacityError,
     InputError,
@@ -40,9 +40,6 @@ from .errors import (
 from .kernel_cache import open_kernel_cache
 
 logger = logging.getLogger(__name__)
-
-# A ti.Ndarray, or a NumPy array where a kernel is given one: Taichi has no types for a checker.
-DeviceArray = Any
 
 DEVICES = ("auto", "cuda", "cpu")
 MAX_THREADS = 4096  # of a CPU
@@ -57,66 +54,6 @@ ti.init only before the first map, or start a new process"""
 GIB = 1 << 30
 # CUDA's pool for sparse voxels: this share of the GPU's memory within limits, and where that is not known
 POOL_SHARE, POOL_LIMITS, POOL_UNKNOWN = 0.25, (1 * GIB, 8 * GIB), 2 * GIB
-
-
-def grown(room: int, needed: int) -> int:
-    """Room for `needed` rows where there is `room`: it doubles, so that growing stays cheap."""
-    return room if needed <= room else max(2 * room, needed)
-
-
-class Arena:
-    """Device arrays that are used again and again, so that a frame allocates nothing.
-
-    What is borrowed is on loan for one turn: it may be overwritten as soon as the next turn begins.
-    New arrays are zero; old ones are as their last user left them.
-    """
-
-    def __init__(self) -> None:
-        self._arrays: dict[tuple, Any] = {}
-        self._turn = 0
-
-    def borrow(self, name: str, dtype: Any, shape: tuple[int, ...]) -> DeviceArray:
-        """A device array of at least `shape[0]` rows of shape `shape[1:]`, for the use `name`."""
-        import taichi as ti
-
-        key = (name, str(dtype), shape[1:])
-        known = self._arrays.get(key)
-        if known is None or known.shape[0] < shape[0]:
-            rows = grown(known.shape[0] if known is not None else shape[0], shape[0])
-            self._arrays[key] = ti.ndarray(dtype, (rows, *shape[1:]))
-        return self._arrays[key]
-
-    def exact(self, name: str, make: Callable[[], Any], shape: tuple[int, ...]) -> Any:
-        """What `make` makes, once for every use `name` and shape."""
-        key = (name, shape)
-        if key not in self._arrays:
-            self._arrays[key] = make()
-        return self._arrays[key]
-
-    def next_turn(self) -> Loan:
-        """Begin a turn: all loans of earlier turns are over."""
-        self._turn += 1
-        return Loan(self, self._turn)
-
-    def is_over(self, turn: int) -> bool:
-        """Whether what was borrowed in `turn` may have been overwritten."""
-        return turn != self._turn
-
-
-@dataclass(frozen=True)
-class Loan:
-    """What was borrowed in one turn of an arena."""
-
-    arena: Arena
-    turn: int
-
-    def check(self) -> None:
-        """Raise RuntimeStateError where it is over."""
-        if self.arena.is_over(self.turn):
-            raise RuntimeStateError(
-                "this local LIM is no longer there: another cloud was encoded since; fuse it "
-                "before that, or keep local.copy()"
-            )
 
 
 class Runtime:

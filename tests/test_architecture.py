@@ -13,11 +13,12 @@ LOOSE_FILES = {"__init__", "types", "errors", "runtime", "config", "preprocessin
     "run_log",
     "__main__",
     "kernel_cache",
+    "device_arrays",
 }
 # From the ground up. A room imports from lower floors alone, also where it imports within functions.
 FLOORS = [
     {"errors"},
-    {"kernel_cache", "geometry"},
+    {"kernel_cache", "device_arrays", "geometry"},
     {"runtime"},
     {"kernels"},
     {"types"},

@@ -11,7 +11,7 @@ from typing import Any
 
 import taichi as ti
 
-from ..runtime import DeviceArray
+from ..device_arrays import DeviceArray
 from .arrays import Bytes2, Bytes3, Floats2, Floats3, Ints1, Ints2, Sums3
 from .camera import Intrinsics, Pose, lift, move, ray, rotate
 from .images import inverse_depth_slope, segment, segments

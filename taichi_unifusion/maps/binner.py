@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import Arena, DeviceArray, host
 from ..errors import OutOfRange
 from ..kernels import binning as kernels
 from ..kernels import ti
@@ -17,7 +18,6 @@ from ..kernels.index import INDEX_HALF, block_of_points, forget_blocks, touch_po
 from ..kernels.patches import Patches, Sink, Target, Values
 from ..kernels.pools import copy_rows
 from ..kernels.regression import find_neighbors
-from ..runtime import Arena, DeviceArray
 from ..types import PointCloud
 from .local_lim import FIRST_BLOCKS, Binned, CellArrays, OpenCells, SortedSamples
 from .voxel_grid import VoxelGrid
@@ -300,7 +300,7 @@ def patches_of(cloud: PointCloud, device: str) -> Patches:
 
 def _side_by_side(arrays: Sequence[DeviceArray], scales: Sequence[float]) -> NDArray[np.float32]:
     """Arrays of values (N, c), each times its scale, as one."""
-    rows = [each if isinstance(each, np.ndarray) else each.to_numpy() for each in arrays]
+    rows = [host(each) for each in arrays]
     few = min(map(len, rows))
     return np.hstack(
         [each[:few] * np.float32(scale) for each, scale in zip(rows, scales, strict=True)]

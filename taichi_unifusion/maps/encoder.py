@@ -9,12 +9,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import Arena, DeviceArray
 from ..errors import InputError
 from ..geometry.checks import as_numbers
 from ..kernels import query, regression, ti
 from ..kernels.cells import CELLS
 from ..kernels.layout import Layout
-from ..runtime import Arena, DeviceArray, Runtime, compiled_sooner
+from ..runtime import Runtime, compiled_sooner
 from .encoding import position_encoding
 from .local_lim import Binned, LocalLim, SortedSamples
 from .settings import MapSettings

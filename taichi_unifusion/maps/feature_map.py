@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
+from ..device_arrays import DeviceArray
 from ..errors import FrameError, InputError, strict
 from ..geometry.checks import as_numbers
 from ..kernels import feature_query as decoding
@@ -17,7 +18,6 @@ from ..kernels import features as kernels
 from ..kernels import ti
 from ..kernels.cells import CELLS
 from ..kernels.patches import Patches
-from ..runtime import DeviceArray
 from ..types import Frame, ImageView, PointCloud
 from .base_map import BaseMap, Integration, check_cloud
 from .binner import Binner, patches_of

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import DeviceArray
 from ..geometry.se3 import distance, inverse, normalized
 from ..kernels.keeping import shrink_depth
-from ..runtime import DeviceArray
 from ..types import ImageView, PinholeCamera
 from .kept_cells import KeptCells, Levels
 from .lenses import through_lenses

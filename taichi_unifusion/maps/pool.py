@@ -7,10 +7,10 @@ from math import prod
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import DeviceArray
 from ..errors import CapacityError
 from ..kernels import ti
 from ..kernels.pools import copy_rows, gather_rows, scatter_rows
-from ..runtime import DeviceArray
 from .voxel_data import VoxelField
 
 MAX_ELEMENTS = 2**31 - 1  # of an array of Taichi

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
+from ..device_arrays import DeviceArray
 from ..errors import InputError, strict
 from ..kernels.patches import Patches, Values
-from ..runtime import DeviceArray
 from ..types import Frame, PointCloud, largest_magnitude
 from .binner import Binner, patches_of
 from .encoder import Encoder

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
+from ..device_arrays import DeviceArray
 from ..kernels import fusion, sides
 from ..kernels.cells import BLOCK_CELLS
 from ..kernels.keeping import round_rows
 from ..kernels.layout import Layout
 from ..kernels.patches import Patches, Values
-from ..runtime import DeviceArray
 from ..types import PointCloud
 from .base_map import BaseMap, Integration, S, check_cloud
 from .binner import Binner

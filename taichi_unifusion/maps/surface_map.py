@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import runtime
+from ..device_arrays import DeviceArray
 from ..errors import InputError, check_box, check_range, check_whole, shortened
 from ..geometry.checks import as_numbers
 from ..kernels import visibility
 from ..kernels.cells import CELLS
 from ..kernels.patches import Patches, Values
-from ..runtime import DeviceArray
 from ..types import Frame, Mesh, PinholeCamera, PointCloud
 from .binner import SurfelBinner, patches_of
 from .distance import distances

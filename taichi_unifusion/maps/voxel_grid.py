@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
+from ..device_arrays import DeviceArray, grown
 from ..errors import CapacityError
 from ..kernels import index as kernels
 from ..kernels import ti
-from ..runtime import DeviceArray, grown
 from .pool import Pool
 from .voxel_data import KEYS, VoxelData, VoxelField
 

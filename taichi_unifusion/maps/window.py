@@ -18,15 +18,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import Arena, DeviceArray
 from ..errors import UniFusionError
 from ..geometry.se3 import distance, inverse
 from ..kernels import ti
 from ..kernels.patches import Patches, Targets
-from ..runtime import Arena, DeviceArray
 from ..types import Frame, PinholeCamera
 from .kept_window import KeptCells, KeptFeatures, KeptViews, KeptWindow
 from .lenses import lens_beside, nearly_same, through_lenses
-from .local_lim import CellArrays, OpenCells
+from .local_lim import CellArrays
+from .open_part import OpenPart
 from .property_group import MapGroup, Part
 from .regression_map import RegressionMap
 from .surface_map import SurfaceMap
@@ -37,9 +38,9 @@ from .value_scale import exponents_for, fits, steps_for
 FARTHEST_MOVE, LARGEST_TURN = 0.6, 30.0
 GAP = 3  # a step between frames that is so many times the usual one ends a window
 ROOM = 256 << 20  # bytes of a part's sums, or of depth images, beyond which a window ends
-VOTE_PIECES = 20
+VOTE_PIECES = 40
 NEVER = 2**31 - 1  # as the first block to add to
-PIECE = 10_000  # blocks encoded at once, times the rank
+PIECE = 10_000  # blocks encoded at once, times the rank, and twice if samples carry normals
 
 
 @dataclass(frozen=True)
@@ -57,24 +58,6 @@ class FindPatches(Protocol):
     """Makes the patches of a frame, and sums them up in the cells of targets."""
 
     def __call__(self, targets: Targets, *, write: bool) -> Patches: ...
-
-
-@dataclass
-class OpenPart:
-    """What a window sums up for the maps of one part."""
-
-    part: Part
-    cells: OpenCells
-    arena: Arena  # of what comes out of them
-
-    @property
-    def bytes(self) -> int:
-        return self.cells.count * self.cells.arrays.block_bytes
-
-    def kept_cells(self) -> KeptCells:
-        """What is summed up, which becomes what is kept of it."""
-        channels = [each.channels for each in self.part.maps]
-        return KeptCells.of(self.cells, self.part.binner, channels)
 
 
 @dataclass
@@ -233,7 +216,7 @@ class Window:
         if self.apart:  # the sums are free, and nothing is fused
             return
         local = encoder.room(binned)
-        step = PIECE // encoder.layout.size
+        step = PIECE // (encoder.layout.size * (2 if encoder.layout.derivatives else 1))
         for begin in range(0, max(binned.count, 1), step):
             end = min(begin + step, binned.count)
             yield Piece(name, partial(encoder.encode_blocks, binned, begin, end, local))
@@ -268,6 +251,7 @@ class WindowFusion:
         self._last: Window | None = None  # the window of the last frame, which may be closed
         self.pieces: deque[Piece] = deque()
         self._begun: Piece | None = None  # that was handed out, and is not done
+        self._just_closed = False  # whether the work that ends a window was done in this frame
         self._rehearsals: list[Piece] = []  # for the first frame that has something for a part
         self._maps: set[RegressionMap] = set()  # that wait
         self.borders = (0, 0)  # where windows end: the last frame's place, and the usual step
@@ -335,16 +319,19 @@ class WindowFusion:
             self.run(len(self.pieces))
             self._rehearsals.clear()  # they would take the arena from under the work itself
             self.pieces.extend(self.window.close(self.keep))
-            self.window = None
+            self.window, self._just_closed = None, True
             self.settle()
             self._images.reverse()
 
     def due(self, frames: int = 0) -> Iterator[Piece]:
         """The pieces to do now, so that all are done when the next window is full, or in so many
-        frames.
+        frames: none in the frame that ended a window, which has enough to do, unless it is one itself.
         """
         while self._rehearsals:
             yield self._rehearsals.pop(0)
+        busy, self._just_closed = self._just_closed and self.size > 1 and not frames, False
+        if busy:
+            return
         frames_left = frames or self.size - (len(self.window) if self.window else 0)
         for _ in range(-(-len(self.pieces) // max(frames_left, 1))):
             self._begun = self.pieces.popleft()

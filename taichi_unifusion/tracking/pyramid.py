@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..runtime import DeviceArray
+from ..device_arrays import DeviceArray
 from ..types import Frame, PinholeCamera
 
 # [px] wider images are averaged to at least this width; finer ones add time and noise, no accuracy

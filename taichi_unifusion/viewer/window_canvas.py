@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
+from ..device_arrays import grown
 from ..errors import MissingDependency
 from ..files.ply import color_to_uint8
 from ..geometry.triangles import area_vectors
@@ -182,7 +183,7 @@ class _Rows:
 
         kind = np.int32 if self.integer else np.float32
         if len(rows) > self.room or self.field is None:
-            self.room = runtime.grown(self.room, len(rows))
+            self.room = grown(self.room, len(rows))
             if self.integer:
                 self.field = ti.field(ti.i32, self.room)
             else:

@@ -17,7 +17,7 @@ from taichi_unifusion.maps import PropertyMap, SurfaceMap
 from taichi_unifusion.maps.binner import patches_of
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.local_lim import CellArrays
-from taichi_unifusion.runtime import Arena
+from taichi_unifusion.device_arrays import Arena
 
 SIX_RANKS = {"encoder": EncoderSettings(rank=6, anchors=64), "noise": 0.3, "voxel_size": 0.05}
 

@@ -1,0 +1,91 @@
+"""Arrays on the device: how they are made, and those that are used again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import RuntimeStateError
+
+# A ti.Ndarray, or a NumPy array where a kernel is given one: Taichi has no types for a checker.
+DeviceArray = Any
+
+
+def grown(room: int, needed: int) -> int:
+    """Room for `needed` rows where there is `room`: it doubles, so that growing stays cheap."""
+    return room if needed <= room else max(2 * room, needed)
+
+
+def zeros(dtype: Any, shape: tuple[int, ...]) -> DeviceArray:
+    """Zeros of a type of Taichi's on the device.
+
+    On the CPU memory is taken only where they are written to: much room costs nothing, and no frame
+    waits for it.
+    """
+    import taichi as ti
+
+    if ti.lang.impl.current_cfg().arch == ti.cuda:
+        return ti.ndarray(dtype, shape)
+    return np.zeros(shape, ti.lang.util.to_numpy_type(dtype))
+
+
+def host(array: DeviceArray) -> NDArray:
+    """The numbers of an array, where NumPy can read them."""
+    return array if isinstance(array, np.ndarray) else array.to_numpy()
+
+
+class Arena:
+    """Device arrays that are used again and again, so that a frame allocates nothing.
+
+    What is borrowed is on loan for one turn: it may be overwritten as soon as the next turn begins.
+    New arrays are zero; old ones are as their last user left them.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple, Any] = {}
+        self._turn = 0
+
+    def borrow(self, name: str, dtype: Any, shape: tuple[int, ...]) -> DeviceArray:
+        """A device array of at least `shape[0]` rows of shape `shape[1:]`, for the use `name`."""
+        key = (name, str(dtype), shape[1:])
+        known = self._arrays.get(key)
+        if known is None or known.shape[0] < shape[0]:
+            rows = grown(known.shape[0] if known is not None else shape[0], shape[0])
+            self._arrays[key] = zeros(dtype, (rows, *shape[1:]))
+        return self._arrays[key]
+
+    def exact(self, name: str, make: Callable[[], Any], shape: tuple[int, ...]) -> Any:
+        """What `make` makes, once for every use `name` and shape."""
+        key = (name, shape)
+        if key not in self._arrays:
+            self._arrays[key] = make()
+        return self._arrays[key]
+
+    def next_turn(self) -> Loan:
+        """Begin a turn: all loans of earlier turns are over."""
+        self._turn += 1
+        return Loan(self, self._turn)
+
+    def is_over(self, turn: int) -> bool:
+        """Whether what was borrowed in `turn` may have been overwritten."""
+        return turn != self._turn
+
+
+@dataclass(frozen=True)
+class Loan:
+    """What was borrowed in one turn of an arena."""
+
+    arena: Arena
+    turn: int
+
+    def check(self) -> None:
+        """Raise RuntimeStateError where it is over."""
+        if self.arena.is_over(self.turn):
+            raise RuntimeStateError(
+                "this local LIM is no longer there: another cloud was encoded since; fuse it "
+                "before that, or keep local.copy()"
+            )
