@@ -27,10 +27,11 @@ def zeros(dtype: Any, shape: tuple[int, ...]) -> DeviceArray:
     waits for it.
     """
     import taichi as ti
+    from taichi.lang import impl, util
 
-    if ti.lang.impl.current_cfg().arch == ti.cuda:
+    if impl.current_cfg().arch == ti.cuda:
         return ti.ndarray(dtype, shape)
-    return np.zeros(shape, ti.lang.util.to_numpy_type(dtype))
+    return np.zeros(shape, util.to_numpy_type(dtype))
 
 
 def host(array: DeviceArray) -> NDArray:

@@ -2,9 +2,13 @@
 
 import taichi as ti
 
+from .layout import LANES
+
+Lanes = ti.types.vector(LANES, ti.f32)
 Floats1 = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Floats2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
 Floats3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
+Lanes3 = ti.types.ndarray(dtype=Lanes, ndim=3)
 Ints1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
 Ints2 = ti.types.ndarray(dtype=ti.i32, ndim=2)
 Sums3 = ti.types.ndarray(dtype=ti.i64, ndim=3)

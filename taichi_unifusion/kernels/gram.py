@@ -1,59 +1,85 @@
 """The Gram matrix of a voxel's regression: summed from tiles of samples, solved, or kept as sums.
 
-G holds the lower triangle of P^T W P in its first `size` rows and Y^T W P in the rows below, as one
-vector of a thread.
+A sample is a row of vectors: f_posi, then its targets and, if centred, a one, all times the root of
+its weight. G holds the lower triangle of P^T W P in its first `size` rows and Y^T W P in the rows
+below, as one vector of a thread; while it is summed up it lies in vectors of `LANES` columns.
 """
+
+from dataclasses import dataclass
 
 import taichi as ti
 
-from .layout import PATCH
+from .layout import LANES, PATCH
+
+TILE = 64  # samples that are held at once
+BATCH = 4  # of them, those whose products are added to a vector of G at once
+
+
+@dataclass(frozen=True, eq=False)
+class Scratch:
+    """What each of W workers needs to itself, as one compile-time argument: fields, because their
+    strides are known when compiling.
+    """
+
+    tiles: ti.Field  # (W, TILE, V) vectors of samples
+    products: ti.Field  # (W, V x LANES, V) vectors of their products
+
+    @property
+    def workers(self) -> int:
+        return self.tiles.shape[0]
 
 
 @ti.func
-def add_tile(
+def clear_products(layout: ti.template(), worker: ti.i32, scratch: ti.template()):
+    """No samples yet."""
+    for i in range(layout.vectors * LANES):
+        for right in range(layout.feature_vectors):
+            scratch.products[worker, i, right] = ti.Vector([0.0] * LANES)
+
+
+@ti.func
+def put_number(
+    scratch: ti.template(), worker: ti.i32, sample: ti.i32, column: ti.template(), y: ti.f32
+):
+    """One of the numbers of a sample in a worker's tile."""
+    scratch.tiles[worker, sample, column // LANES][column % LANES] = y
+
+
+@ti.func
+def add_samples(
     layout: ti.template(),
     worker: ti.i32,
     filled: ti.i32,
-    tiles: ti.template(),
-    G: ti.template(),
+    scratch: ti.template(),
 ):
-    """G += P W P^T over the `filled` samples in a worker's tile, whose columns are zero up to the
-    next multiple of 16.
+    """Add the products of the `filled` samples in a worker's tile to those before, below the diagonal
+    and in the blocks on it; first clears the samples that round them up to a whole batch.
     """
-    size, rows = ti.static(layout.size, layout.rows)
-    length = (filled + 15) // 16 * 16
-    for i in range(rows // PATCH):
-        for j in range(ti.min(i + 1, size // PATCH)):
-            sums = ti.Vector([0.0] * (PATCH * PATCH))
-            for k in range(length):
-                for a in ti.static(range(PATCH)):
-                    for b in ti.static(range(PATCH)):
-                        sums[a * PATCH + b] += (
-                            tiles[worker, i * PATCH + a, k] * tiles[worker, j * PATCH + b, k]
+    batches = (filled + BATCH - 1) // BATCH
+    for k in range(filled, batches * BATCH):
+        for part in range(layout.vectors):
+            scratch.tiles[worker, k, part] = ti.Vector([0.0] * LANES)
+    for batch in range(batches):
+        k = batch * BATCH
+        for right in range(layout.feature_vectors):
+            for left in range(right, layout.vectors):
+                for a in ti.static(range(LANES)):
+                    row = scratch.products[worker, left * LANES + a, right]
+                    for m in ti.static(range(BATCH)):
+                        row += (
+                            scratch.tiles[worker, k + m, left][a]
+                            * scratch.tiles[worker, k + m, right]
                         )
-            for a in ti.static(range(PATCH)):
-                for b in ti.static(range(PATCH)):
-                    G[(i * PATCH + a) * size + j * PATCH + b] += sums[a * PATCH + b]
+                    scratch.products[worker, left * LANES + a, right] = row
 
 
 @ti.func
-def flush(
-    layout: ti.template(),
-    worker: ti.i32,
-    filled: ti.i32,
-    tiles: ti.template(),
-    G: ti.template(),
-):
-    """Add what a worker's tile holds to G, first clearing the columns that round it up to a
-    multiple of 16.
-
-    It is most of what a kernel compiles, so kernels call it in one place: when the tile is full,
-    and in a round after the last neighbour for what is left.
-    """
-    for row in range(layout.rows):
-        for k in range(filled, (filled + 15) // 16 * 16):
-            tiles[worker, row, k] = 0.0
-    add_tile(layout, worker, filled, tiles, G)
+def take_products(layout: ti.template(), worker: ti.i32, scratch: ti.template(), G: ti.template()):
+    """G of the products that were summed up."""
+    size = ti.static(layout.size)
+    for i in range(layout.rows):
+        for j in ti.static(range(size)):
+            G[i * size + j] = scratch.products[worker, i, j // LANES][j % LANES]
 
 
 @ti.func

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-PATCH = 4  # products run in patches of 4 x 4 numbers that stay in registers
+PATCH = 4  # the solve runs in patches of 4 x 4 numbers that stay in registers
+LANES = 8  # numbers that a vector holds, in which products are summed up
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,16 @@ class Layout:
     def rows(self) -> int:
         """Rows of the Gram matrix: P^T P, then the targets and, if centred, the ones."""
         return self.size + _whole_patches(self.channels + self.centered)
+
+    @property
+    def vectors(self) -> int:
+        """Vectors that hold a row of P, then the targets and, if centred, the one."""
+        return -(-self.rows // LANES)
+
+    @property
+    def feature_vectors(self) -> int:
+        """Vectors, the first of them, that hold f_posi; the last may hold targets too."""
+        return -(-self.size // LANES)
 
     @property
     def latent_rows(self) -> int:

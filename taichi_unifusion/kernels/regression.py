@@ -5,21 +5,29 @@ sample in the doubled voxel, W the number of points behind it. The targets Y rid
 rows of P^T, so that one Gram product gives both P^T W P and Y^T W P, and the forward half of the
 solve falls out of the Cholesky factorisation.
 
-Sizes stand in a `Layout`: multiples of 4, so that everything runs in 4x4 patches that stay in
-registers. A *worker* is a thread with a scratch tile of its own that takes a run of voxels.
+Sizes stand in a `Layout`: products are summed up in vectors of 8 numbers, and the solve runs in 4x4
+patches, which stay in registers. A *worker* is a thread with scratch of its own, a tile of samples
+and their products, that takes a run of voxels.
 """
 
 import taichi as ti
 
-from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Masks2, row3
+from .arrays import Floats1, Floats2, Floats3, Ints1, Ints2, Lanes3, Masks2, row3
 from .cells import CELLS, cell_bit, cells_before, first_cell
 from .encoding import position_features, position_gradient
-from .gram import flush, keep_sums, solve_voxel
+from .gram import (
+    TILE,
+    add_samples,
+    clear_products,
+    keep_sums,
+    put_number,
+    solve_voxel,
+    take_products,
+)
 from .index import INDEX_HALF, block_in, in_range
 from .tasks import worker_stride
 
 LEAST_SHARE = 1e-3  # of a cell's points that have a normal, below which it is left out
-TILE = 128  # samples whose features are held at once: the products run over this contiguous axis
 
 
 @ti.func
@@ -74,23 +82,23 @@ def add_cell(
     cells: ti.template(),
     features: ti.template(),
     # in and out:
-    tiles: ti.template(),
+    scratch: ti.template(),
     mean: ti.template(),
 ) -> ti.i32:
     """Put the cell in row n, whose features stand in row `at` of the table, into a worker's tile;
-    returns how many columns of it are filled then.
+    returns how many samples are in it then.
     """
     size, channels = ti.static(layout.size, layout.channels)
-    root, column = cells[n, 0], filled
-    for a in ti.static(range(size)):
-        tiles[worker, a, column] = features[at, 0, a] * root
+    root, sample = cells[n, 0], filled
+    for part in ti.static(range(layout.feature_vectors)):
+        scratch.tiles[worker, sample, part] = features[at, 0, part] * root
     for c in ti.static(range(channels)):
         y = cells[n, 1 + c]
-        tiles[worker, size + c, column] = y
+        put_number(scratch, worker, sample, size + c, y)
         mean[c] += y * root
     if ti.static(layout.centered):
-        tiles[worker, size + channels, column] = root
-    column += 1
+        put_number(scratch, worker, sample, size + channels, root)
+    sample += 1
     if ti.static(layout.derivatives):
         normal = ti.Vector([cells[n, 2], cells[n, 3], cells[n, 4]])
         share = 1.0  # of the cell's points, those that have a normal and agree on it
@@ -99,11 +107,12 @@ def add_cell(
         if share > LEAST_SHARE:
             scale = ti.sqrt(share)
             for axis in ti.static(range(3)):  # Eq. 16: one more row an axis, its target the normal
-                for a in ti.static(range(size)):
-                    tiles[worker, a, column] = features[at, 1 + axis, a] * (root * scale)
-                tiles[worker, size, column] = normal[axis] / scale
-                column += 1
-    return column
+                for part in ti.static(range(layout.feature_vectors)):
+                    f = features[at, 1 + axis, part]
+                    scratch.tiles[worker, sample, part] = f * (root * scale)
+                put_number(scratch, worker, sample, size, normal[axis] / scale)
+                sample += 1
+    return sample
 
 
 @ti.kernel
@@ -121,20 +130,20 @@ def encode_cells(
     # (M, 1 + c [+ 3]) root of the count, then the mean targets, and normals if `derivatives`, times
     # it
     cells: Floats2,
-    # (8^3, 1 or 4, size) f_posi, and 1/2 df/dt if `derivatives`, at the cell centres of a doubled
-    # voxel
-    features: Floats3,
+    # (8^3, 1 or 4, V vectors) f_posi, and 1/2 df/dt if `derivatives`, at the cell centres of a
+    # doubled voxel
+    features: Lanes3,
     minimum: ti.i32,  # blocks with fewer points are not encoded
     noise: ti.f32,  # d of Eq. 6, of one frame, in units of the kernel's variance
     # out:
-    tiles: ti.template(),  # (W, rows, TILE) scratch of W workers
+    scratch: ti.template(),  # of W workers
     weights: Floats1,  # (B,) points in the doubled voxel, 0 where not encoded
     # (B, l [+ 1], c) F, then the prior mean; (B, q, 1) the sums of `keep_sums` for fusion by
     # information
     encoded: Floats3,
 ):
     size, channels = ti.static(layout.size, layout.channels)
-    stride, workers = ti.static(worker_stride(), tiles.shape[0])
+    stride, workers = ti.static(worker_stride(), scratch.workers)
     for i in range(workers * stride):
         if i % stride == 0:
             worker = i // stride
@@ -143,10 +152,10 @@ def encode_cells(
             for v in range(first_block, begin + (worker + 1) * blocks // workers):
                 weights[v] = 0.0
                 if rows[v, 1] >= minimum:
-                    G = ti.Vector([0.0] * (layout.rows * size))
+                    clear_products(layout, worker, scratch)
                     mean = ti.Vector([0.0] * channels)
                     filled, weight, seen = 0, 0.0, ti.u32(0)
-                    for o in range(28):  # the last round has no neighbour, see `flush`
+                    for o in range(28):  # a last round adds what is left
                         last = o == 27
                         b, step = v, neighbor_step(o)
                         if not last:
@@ -176,19 +185,30 @@ def encode_cells(
                                             at,
                                             cells,
                                             features,
-                                            tiles,
+                                            scratch,
                                             mean,
                                         )
                                         weight += cells[n, 0] * cells[n, 0]
                                     if filled > TILE - 4 or (last and filled > 0):
-                                        flush(layout, worker, filled, tiles, G)
+                                        add_samples(layout, worker, filled, scratch)
                                         filled = 0
                                 first += ti.cast(ti.math.popcnt(occupied), ti.i32)
+                    G = ti.Vector([0.0] * (layout.rows * size))
+                    take_products(layout, worker, scratch, G)
                     if ti.static(layout.information):
                         keep_sums(layout, v, weight, mean, G, encoded, weights)
                     else:
                         frames = ti.cast(ti.math.popcnt(seen), ti.f32)
                         solve_voxel(layout, v, noise * frames, weight, mean, G, encoded, weights)
+
+
+@ti.func
+def put_features(
+    layout: ti.template(), worker: ti.i32, sample: ti.i32, f: ti.template(), scratch: ti.template()
+):
+    """Put features into a worker's tile, with zeros up to whole patches."""
+    for a in ti.static(range(layout.size)):
+        put_number(scratch, worker, sample, a, f[a] if ti.static(a < layout.rank) else 0.0)
 
 
 @ti.kernel
@@ -206,26 +226,23 @@ def encode_points(
     minimum: ti.i32,  # doubled voxels with fewer samples are not encoded
     noise: ti.f32,
     # out: as encode_cells
-    tiles: ti.template(),  # (W, rows, TILE)
+    scratch: ti.template(),  # of W workers
     weights: Floats1,  # (B,)
     encoded: Floats3,  # (B, l [+ 1], c) or (B, q, 1)
 ):
     rank, size, channels = ti.static(layout.rank, layout.size, layout.channels)
-    stride, workers = ti.static(worker_stride(), tiles.shape[0])
+    stride, workers = ti.static(worker_stride(), scratch.workers)
     blocks = starts.shape[0] - 1
     for i in range(workers * stride):
         if i % stride == 0:
             worker = i // stride
-            for row in range(layout.rows):
-                for k in range(TILE):
-                    tiles[worker, row, k] = 0.0
             for v in range(worker * blocks // workers, (worker + 1) * blocks // workers):
                 weights[v] = 0.0
-                G = ti.Vector([0.0] * (layout.rows * size))
+                clear_products(layout, worker, scratch)
                 mean = ti.Vector([0.0] * channels)
                 ijk = row3(keys, v)
                 filled, weight = 0, 0.0
-                for o in range(28):  # the last round has no neighbour, see `flush`
+                for o in range(28):  # a last round adds what is left
                     last, begin, end = o == 27, 0, 1
                     if not last:
                         b = neighbors[v, o]
@@ -236,28 +253,27 @@ def encode_points(
                         t = (row3(samples, n) - ijk - 0.5) * 0.5
                         if not last and ti.abs(t).max() <= 0.5:
                             f = position_features(t, rank, anchors, projection, scale)
-                            for a in ti.static(range(rank)):
-                                tiles[worker, a, filled] = f[a]
+                            put_features(layout, worker, filled, f, scratch)
                             for c in ti.static(range(channels)):
-                                tiles[worker, size + c, filled] = targets[n, c]
+                                put_number(scratch, worker, filled, size + c, targets[n, c])
                                 mean[c] += targets[n, c]
                             if ti.static(layout.centered):
-                                tiles[worker, size + channels, filled] = 1.0
+                                put_number(scratch, worker, filled, size + channels, 1.0)
                             filled += 1
                             if ti.static(layout.derivatives):
                                 normal = ti.Vector([targets[n, 1], targets[n, 2], targets[n, 3]])
                                 for axis in range(3 if normal.norm() > LEAST_SHARE else 0):
                                     g = position_gradient(t, axis, rank, anchors, projection, scale)
-                                    for a in ti.static(range(rank)):
-                                        # d/dx = 1/2 d/dt
-                                        tiles[worker, a, filled] = 0.5 * g[a]
-                                    tiles[worker, size, filled] = targets[n, 1 + axis]
+                                    put_features(layout, worker, filled, 0.5 * g, scratch)  # dt/dx
+                                    put_number(scratch, worker, filled, size, targets[n, 1 + axis])
                                     filled += 1
                             weight += 1.0
                         if filled > TILE - 4 or (last and filled > 0):
-                            flush(layout, worker, filled, tiles, G)
+                            add_samples(layout, worker, filled, scratch)
                             filled = 0
                 if weight >= minimum:
+                    G = ti.Vector([0.0] * (layout.rows * size))
+                    take_products(layout, worker, scratch, G)
                     if ti.static(layout.information):
                         keep_sums(layout, v, weight, mean, G, encoded, weights)
                     else:

@@ -13,8 +13,10 @@ from ..device_arrays import Arena, DeviceArray
 from ..errors import InputError
 from ..geometry.checks import as_numbers
 from ..kernels import query, regression, ti
+from ..kernels.arrays import Lanes
 from ..kernels.cells import CELLS
-from ..kernels.layout import Layout
+from ..kernels.gram import TILE, Scratch
+from ..kernels.layout import LANES, Layout
 from ..runtime import Runtime, compiled_sooner
 from .encoding import position_encoding
 from .local_lim import Binned, LocalLim, SortedSamples
@@ -38,20 +40,23 @@ class Encoder:
         self.min_points, self.noise = settings.min_points, settings.noise
         self.tables = PositionTables(settings, runtime.arena)
         self.window = window_masks(settings.margin)
-        self.cell_features = to_device(self._cell_features())
-        self.tiles = _tiles(runtime, layout)
+        self.cell_features = self._cell_features()
+        self.scratch = _scratch(runtime, layout)
 
-    def _cell_features(self) -> NDArray[np.float64]:
-        """(8^3, 1 or 4, size): f_posi, and its gradient by voxel units, at the cell centres of a
+    def _cell_features(self) -> DeviceArray:
+        """(8^3, 1 or 4, V vectors): f_posi, and its gradient by voxel units, at the cell centres of a
         doubled voxel.
         """
         encoding, rank = self.tables.encoding, self.layout.rank
         t = encoding.nodes(2 * CELLS)
-        table = np.zeros((len(t), 4 if self.layout.derivatives else 1, self.layout.size))
+        vectors = self.layout.feature_vectors
+        table = np.zeros((len(t), 4 if self.layout.derivatives else 1, vectors * LANES), np.float32)
         table[:, 0, :rank] = encoding(t)
         if self.layout.derivatives:
             table[:, 1:, :rank] = 0.5 * encoding.gradient(t)  # t moves by 1/2 a voxel
-        return table
+        on_device: DeviceArray = ti.ndarray(Lanes, (*table.shape[:2], vectors))
+        on_device.from_numpy(table.reshape(*table.shape[:2], vectors, LANES))
+        return on_device
 
     def encode(self, binned: Binned) -> LocalLim:
         """Encode the averages in cells."""
@@ -75,7 +80,7 @@ class Encoder:
             self.cell_features,
             self.min_points,
             self.noise,
-            self.tiles,
+            self.scratch,
             local.weights,
             local.encoded,
         )
@@ -97,7 +102,7 @@ class Encoder:
             self.tables.scale,
             self.min_points,
             self.noise,
-            self.tiles,
+            self.scratch,
             local.weights,
             local.encoded,
         )
@@ -212,12 +217,17 @@ def workers(runtime: Runtime, on_gpu: int = GPU_WORKERS) -> int:
     return CPU_WORKERS if runtime.device == "cpu" else on_gpu
 
 
-def _tiles(runtime: Runtime, layout: Layout) -> ti.Field:
-    """Scratch of the workers, one for all maps of a runtime; a field, because its strides are known
-    when compiling.
-    """
-    shape = (workers(runtime), layout.rows, regression.TILE)
-    return runtime.arena.exact("tiles", lambda: ti.field(ti.f32, shape), shape)
+def _scratch(runtime: Runtime, layout: Layout) -> Scratch:
+    """Scratch of the workers, one for all maps of a runtime whose samples are as long."""
+    count, vectors = workers(runtime), layout.vectors
+
+    def make() -> Scratch:
+        return Scratch(
+            tiles=ti.Vector.field(LANES, ti.f32, (count, TILE, vectors)),
+            products=ti.Vector.field(LANES, ti.f32, (count, vectors * LANES, vectors)),
+        )
+
+    return runtime.arena.exact("samples", make, (count, vectors))
 
 
 def to_device(array: NDArray) -> DeviceArray:

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import runtime
-from ..device_arrays import DeviceArray
 from ..geometry.triangles import areas, fill_normals
 from ..kernels import marching_cubes as kernels
 from ..kernels import query

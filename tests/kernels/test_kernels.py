@@ -152,4 +152,4 @@ def test_the_rules_see_what_a_function_writes_for_its_caller():
     assert (
         written(index["touch"]) == {"index", "keys", "counters"} <= written(index["touch_points"])
     )
-    assert "tiles" in written(regression["flush"]) and "G" in written(gram["add_tile"])
+    assert "scratch" in written(regression["add_samples"]) and "G" in written(gram["take_products"])

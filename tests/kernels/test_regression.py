@@ -10,14 +10,14 @@ import reference
 from oracle import assert_equal_maps, encoder_of, in_voxels
 from scenes import moved, rough
 
+from taichi_unifusion.device_arrays import Arena
 from taichi_unifusion.kernels import fusion
+from taichi_unifusion.kernels.gram import TILE
 from taichi_unifusion.kernels.layout import Layout
-from taichi_unifusion.kernels.regression import TILE
 from taichi_unifusion.maps import PropertyMap, SurfaceMap
 from taichi_unifusion.maps.binner import patches_of
 from taichi_unifusion.maps.encoding import EncoderSettings
 from taichi_unifusion.maps.local_lim import CellArrays
-from taichi_unifusion.device_arrays import Arena
 
 SIX_RANKS = {"encoder": EncoderSettings(rank=6, anchors=64), "noise": 0.3, "voxel_size": 0.05}
 
