@@ -6,9 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from .errors import RuntimeStateError
 
 # A ti.Ndarray, or a NumPy array where a kernel is given one: Taichi has no types for a checker.
@@ -18,25 +15,6 @@ DeviceArray = Any
 def grown(room: int, needed: int) -> int:
     """Room for `needed` rows where there is `room`: it doubles, so that growing stays cheap."""
     return room if needed <= room else max(2 * room, needed)
-
-
-def zeros(dtype: Any, shape: tuple[int, ...]) -> DeviceArray:
-    """Zeros of a type of Taichi's on the device.
-
-    On the CPU memory is taken only where they are written to: much room costs nothing, and no frame
-    waits for it.
-    """
-    import taichi as ti
-    from taichi.lang import impl, util
-
-    if impl.current_cfg().arch == ti.cuda:
-        return ti.ndarray(dtype, shape)
-    return np.zeros(shape, util.to_numpy_type(dtype))
-
-
-def host(array: DeviceArray) -> NDArray:
-    """The numbers of an array, where NumPy can read them."""
-    return array if isinstance(array, np.ndarray) else array.to_numpy()
 
 
 class Arena:
@@ -52,11 +30,13 @@ class Arena:
 
     def borrow(self, name: str, dtype: Any, shape: tuple[int, ...]) -> DeviceArray:
         """A device array of at least `shape[0]` rows of shape `shape[1:]`, for the use `name`."""
+        import taichi as ti
+
         key = (name, str(dtype), shape[1:])
         known = self._arrays.get(key)
         if known is None or known.shape[0] < shape[0]:
             rows = grown(known.shape[0] if known is not None else shape[0], shape[0])
-            self._arrays[key] = zeros(dtype, (rows, *shape[1:]))
+            self._arrays[key] = ti.ndarray(dtype, (rows, *shape[1:]))
         return self._arrays[key]
 
     def exact(self, name: str, make: Callable[[], Any], shape: tuple[int, ...]) -> Any:

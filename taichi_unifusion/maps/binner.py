@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import Arena, DeviceArray, host
+from ..device_arrays import Arena, DeviceArray
 from ..errors import OutOfRange
 from ..kernels import binning as kernels
 from ..kernels import ti
@@ -300,7 +300,7 @@ def patches_of(cloud: PointCloud, device: str) -> Patches:
 
 def _side_by_side(arrays: Sequence[DeviceArray], scales: Sequence[float]) -> NDArray[np.float32]:
     """Arrays of values (N, c), each times its scale, as one."""
-    rows = [host(each) for each in arrays]
+    rows = [each if isinstance(each, np.ndarray) else each.to_numpy() for each in arrays]
     few = min(map(len, rows))
     return np.hstack(
         [each[:few] * np.float32(scale) for each, scale in zip(rows, scales, strict=True)]

@@ -82,7 +82,7 @@ class KeptCells:
     def of(cls, opened: OpenCells, binner: Binner, channels: Sequence[int]) -> KeptCells:
         """What is summed up, of maps of so many `channels`; the sums become what is kept of them."""
         n, arrays = opened.count, opened.arrays
-        keys = arrays.host_keys(n)
+        keys = arrays.keys.to_numpy()[:n]
         order = np.lexsort(keys[:, 2::-1].T)
         occupied = np.zeros(max(n, 1), np.int32)
         kernels.count_cells(n, arrays.sums, occupied)

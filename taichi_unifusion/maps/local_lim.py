@@ -9,21 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import DeviceArray, Loan, grown, host, zeros
+from ..device_arrays import DeviceArray, Loan, grown
 from ..kernels import ti
 from ..kernels.binning import KEY_COLUMNS
 from ..kernels.cells import BLOCK_CELLS
 from ..kernels.pools import copy_rows
-from ..runtime import current
 
 FIRST_BLOCKS = 2048  # room to begin with
-# of sums: what ten frames of a room take, or that and more where memory is taken as it is used
-FIRST_BYTES = {"cuda": 32 << 20, "cpu": 256 << 20}
+FIRST_BYTES = 32 << 20  # of sums: what a frame of a room takes and more
+WINDOW_BYTES = 96 << 20  # of a window's: what ten frames take, so that hardly any video waits
 
 
 class CellArrays:
@@ -32,13 +30,13 @@ class CellArrays:
     All sums and bits are 0 where nothing is summed up.
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, first_bytes: int = FIRST_BYTES) -> None:
         self.width = width
-        blocks = max(FIRST_BYTES[current().device] // self.block_bytes, FIRST_BLOCKS)
+        blocks = max(first_bytes // self.block_bytes, FIRST_BLOCKS)
         # voxel of each block, and bits of the frames that saw it
-        self.keys: DeviceArray = zeros(ti.i32, (blocks, KEY_COLUMNS))
+        self.keys: DeviceArray = ti.ndarray(ti.i32, (blocks, KEY_COLUMNS))
         # counts, then fixed-point sums of values, by cell
-        self.sums: DeviceArray = zeros(ti.i64, (blocks, BLOCK_CELLS, 1 + width))
+        self.sums: DeviceArray = ti.ndarray(ti.i64, (blocks, BLOCK_CELLS, 1 + width))
 
     @property
     def block_bytes(self) -> int:
@@ -50,13 +48,9 @@ class CellArrays:
         """Blocks that there is room for."""
         return self.sums.shape[0]
 
-    def host_keys(self, rows: int) -> NDArray[np.int32]:
-        """The keys of the first `rows` blocks."""
-        return host(self.keys)[:rows]
-
     def reserve_keys(self, rows: int, used: int) -> None:
         """Make room for the keys of `rows` blocks; the first `used` are kept."""
-        self.keys = _grow(self.keys, ti.i32, rows, used)
+        self.keys = _grow(self.keys, rows, used)
 
     def grow_ahead(self, blocks: int) -> None:
         """Make room for the next window after one of so many blocks, while nothing is summed up:
@@ -68,13 +62,13 @@ class CellArrays:
 
     def reserve(self, rows: int, used: int) -> None:
         """Make room for the sums of `rows` blocks; the first `used` are kept."""
-        self.sums = _grow(self.sums, ti.i64, rows, used)
+        self.sums = _grow(self.sums, rows, used)
 
 
-def _grow(array: DeviceArray, dtype: Any, rows: int, used: int) -> DeviceArray:
+def _grow(array: DeviceArray, rows: int, used: int) -> DeviceArray:
     if rows <= array.shape[0]:
         return array
-    larger = zeros(dtype, (grown(array.shape[0], rows), *array.shape[1:]))
+    larger: DeviceArray = ti.ndarray(array.dtype, (grown(array.shape[0], rows), *array.shape[1:]))
     if used:
         copy_rows(used, array, larger)
     return larger
@@ -156,7 +150,8 @@ class LocalLim:
         """The same by value, which no later cloud overwrites."""
         n = self.count
         keys, encoded, weights, support = (
-            host(a)[:n].copy() for a in (self.keys, self.encoded, self.weights, self.support)
+            np.ascontiguousarray(a[:n] if isinstance(a, np.ndarray) else a.to_numpy()[:n])
+            for a in (self.keys, self.encoded, self.weights, self.support)
         )
         keys = np.ascontiguousarray(keys[:, :3])
         return replace(

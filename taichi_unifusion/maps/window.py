@@ -26,7 +26,7 @@ from ..kernels.patches import Patches, Targets
 from ..types import Frame, PinholeCamera
 from .kept_window import KeptCells, KeptFeatures, KeptViews, KeptWindow
 from .lenses import lens_beside, nearly_same, through_lenses
-from .local_lim import CellArrays
+from .local_lim import WINDOW_BYTES, CellArrays
 from .open_part import OpenPart
 from .property_group import MapGroup, Part
 from .regression_map import RegressionMap
@@ -403,7 +403,7 @@ class WindowFusion:
 
     def _room_of(self, part: Part) -> tuple[CellArrays, Arena]:
         if part.names not in self._room:
-            self._room[part.names] = CellArrays(part.binner.width), Arena()
+            self._room[part.names] = CellArrays(part.binner.width, WINDOW_BYTES), Arena()
         return self._room[part.names]
 
     def _free_images(self, frame: Frame) -> DeviceArray:

@@ -11,7 +11,6 @@ import reference
 from scenes import cloud_of, moved, rough, taken
 
 from taichi_unifusion import PointCloud
-from taichi_unifusion.device_arrays import host
 from taichi_unifusion.errors import OutOfRange
 from taichi_unifusion.kernels import binning
 from taichi_unifusion.kernels.index import block_of_points, forget_blocks, touch_points
@@ -337,7 +336,7 @@ def test_a_frame_of_more_voxels_than_expected_is_given_room(grid):
     rng = np.random.default_rng(2)
     scattered = rng.uniform(-1, 1, (3000, 3)).astype(np.float32)
     binned = Binner(grid, VS, 3).bin(*carrying(scattered, scattered))
-    voxels = set(map(tuple, host(binned.keys)[: binned.count, :3].tolist()))
+    voxels = set(map(tuple, binned.keys.to_numpy()[: binned.count, :3].tolist()))
     assert binned.count > FIRST_BLOCKS
     assert voxels == reference.touch_points(in_voxels(scattered))
     assert binned.rows[:, 1].sum() == len(scattered)
@@ -351,7 +350,7 @@ def test_a_frame_of_more_voxels_than_expected_is_given_room(grid):
         wanted = reference.touch_surfel_samples(
             in_voxels(points), normals.astype(float), [-1.0, 0.0, 1.0]
         )
-        assert set(map(tuple, host(found.keys)[: found.count, :3].tolist())) == wanted
+        assert set(map(tuple, found.keys.to_numpy()[: found.count, :3].tolist())) == wanted
         assert found.rows[:, 1].sum() == 3 * len(points)
 
 

@@ -8,7 +8,6 @@ from reference import unpack_masks
 from scenes import cloud_of, rough
 
 from taichi_unifusion import PointCloud, PropertyMap, load_map
-from taichi_unifusion.device_arrays import host
 from taichi_unifusion.errors import CapacityError, InputError
 from taichi_unifusion.kernels.patches import Values
 from taichi_unifusion.maps import PropertyGroup
@@ -128,10 +127,10 @@ def test_values_are_summed_in_cells_to_the_bit_as_one_array_is(parts):
         binned = Binner(grid, 0.05, 2 + parts).bin(
             patches, [Values(each, patches.counts) for each in given]
         )
-        n, cells = binned.count, host(binned.cells)
-        keys, (starts, totals, _) = host(binned.keys)[:n, :3], binned.rows.T
+        n, cells = binned.count, binned.cells.to_numpy()
+        keys, (starts, totals, _) = binned.keys.to_numpy()[:n, :3], binned.rows.T
         order = np.lexsort(keys.T)  # blocks are numbered as threads come
-        occupied = unpack_masks(host(binned.masks)[:n]).sum(axis=1)
+        occupied = unpack_masks(binned.masks.to_numpy()[:n]).sum(axis=1)
         rows = [cells[start : start + m] for start, m in zip(starts, occupied, strict=True)]
         found.append((totals[order], np.concatenate([rows[b] for b in order])))
     assert found[0][0].sum() == len(cloud)

@@ -26,7 +26,7 @@ from windows import (
 
 from taichi_unifusion import preprocess
 from taichi_unifusion.errors import CapacityError, OutOfRange
-from taichi_unifusion.maps import PropertyMap, SurfaceMap, local_lim, voxel_grid
+from taichi_unifusion.maps import PropertyMap, SurfaceMap, local_lim, voxel_grid, window
 from taichi_unifusion.pipeline import Pipeline
 from taichi_unifusion.run_log import EmptyFrame
 
@@ -232,7 +232,7 @@ def test_what_was_summed_up_before_a_limit_can_be_read_after_it(frames, monkeypa
 def test_cells_that_grow_change_nothing(frames, fused, monkeypatch):
     """What a frame had no room for is added in a second round, before the next one comes."""
     monkeypatch.setattr(local_lim, "FIRST_BLOCKS", 20)
-    monkeypatch.setattr(local_lim, "FIRST_BYTES", {"cpu": 1, "cuda": 1})
+    monkeypatch.setattr(window, "WINDOW_BYTES", 1)
     pipeline = stepped(frames[:2])
     arrays = [each.cells.arrays for each in pipeline.fusion.window.parts.values()]
     assert all(20 < each.room < 2000 for each in arrays)
