@@ -21,7 +21,7 @@ from ..kernels.pools import copy_rows
 
 FIRST_BLOCKS = 2048  # room to begin with
 FIRST_BYTES = 32 << 20  # of sums: what a frame of a room takes and more
-WINDOW_BYTES = 96 << 20  # of a window's: what ten frames take, so that hardly any video waits
+WINDOW_BYTES = 128 << 20  # of a window's: what ten frames take, so that hardly any video waits
 
 
 class CellArrays:
