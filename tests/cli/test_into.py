@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from killing import killed_at
 from scipy.spatial import cKDTree
 
 from taichi_unifusion.cli import viewing
@@ -176,24 +177,10 @@ def test_a_folder_without_results_is_named(tmp_path, capsys):
 # --- Runs that are ended, and maps in tiles -------------------------------------------------------------------------
 
 
-class Killed(BaseException):
-    """Ends a run as kill -9 does: nobody catches it."""
-
-
 def killed(patch, owner, name: str, call: int, *words: str, **frames: int) -> None:
     """A run that dies when a function is called for the so manieth time."""
-    real, calls = getattr(owner, name), []
-
-    def dying(*arguments, **options):
-        calls.append(1)
-        if len(calls) == call:
-            raise Killed
-        return real(*arguments, **options)
-
-    with patch.context() as here:
-        here.setattr(owner, name, dying)
-        with pytest.raises(Killed):
-            reconstruct(*words, **frames)
+    with killed_at(patch, owner, name, call):
+        reconstruct(*words, **frames)
 
 
 def voxels(folder: Path) -> dict[str, dict[str, bytes]]:

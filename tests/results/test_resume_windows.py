@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from killing import killed_at
 from tiny_recording import CONFIG, FLAGS, make_frames
 
 from taichi_unifusion.cli.main import main
@@ -27,28 +28,14 @@ ONE_PASS = ["--tracking", "rgbd", "--tracking-passes", "1"]
 KEPT = ["--keep-windows"]
 
 
-class Killed(BaseException):
-    """Ends a run as kill -9 does: nobody catches it."""
-
-
 def reconstruct(out: Path, *words: str) -> int:
     return main(["reconstruct", "synthetic", *ROOM, *SMALL, "--out", str(out), *words])
 
 
 def killed(monkeypatch, owner, name: str, call: int, out: Path, *words: str) -> None:
     """A run that dies when a function is called for the so manieth time."""
-    real, calls = getattr(owner, name), []
-
-    def dying(*arguments, **options):
-        calls.append(1)
-        if len(calls) == call:
-            raise Killed
-        return real(*arguments, **options)
-
-    with monkeypatch.context() as here:
-        here.setattr(owner, name, dying)
-        with pytest.raises(Killed):
-            reconstruct(out, "--save-every", "1e-9", *words)
+    with killed_at(monkeypatch, owner, name, call):
+        reconstruct(out, "--save-every", "1e-9", *words)
 
 
 @pytest.fixture(autouse=True)
