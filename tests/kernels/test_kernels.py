@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import twin_calls
 
 PACKAGE = Path(__file__).resolve().parents[2] / "taichi_unifusion"
 FILES = sorted(path for path in PACKAGE.rglob("kernels/*.py") if path.name != "__init__.py")
@@ -153,3 +154,10 @@ def test_the_rules_see_what_a_function_writes_for_its_caller():
         written(index["touch"]) == {"index", "keys", "counters"} <= written(index["touch_points"])
     )
     assert "scratch" in written(regression["add_samples"]) and "G" in written(gram["take_products"])
+
+
+def test_every_kernel_has_a_twin_or_is_bookkeeping():
+    """Said here at once; that a test calls both is only known at the end of a whole run."""
+    kernels = twin_calls.kernel_names()
+    assert kernels - twin_calls.BOOKKEEPING <= twin_calls.twin_names()
+    assert kernels >= twin_calls.BOOKKEEPING

@@ -21,6 +21,8 @@ BOOKKEEPING = {
     "claim_slots",
     "find_slots",
     "release_slots",
+    "remove_slots",
+    "clear_index",
     "count_leaves",
     "copy_rows",
     "forget_blocks",
@@ -72,6 +74,16 @@ def record_kernels() -> None:
         return launch(self, *args, **kwargs)
 
     kernel_impl.Kernel.__call__ = recorded
+
+
+def twin_names() -> set[str]:
+    """Every function of the `reference*.py` beside this file."""
+    return {
+        line.removeprefix("def ").partition("(")[0]
+        for file in FOLDER.glob("reference*.py")
+        for line in file.read_text().splitlines()
+        if line.startswith("def ")
+    }
 
 
 class TwinCalls:
