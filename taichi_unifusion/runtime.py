@@ -75,7 +75,6 @@ class Runtime:
         self.free_trees: list[tuple[Any, Any]] = []
         self.grids: WeakSet[Any] = WeakSet()  # of the maps that live
         self.leaves: dict[Any, int] = {}  # index tree -> leaves that it ever had, at most
-        self.earlier: dict[Any, int] = {}  # those that it had for maps that are gone
         # the index tree of the map that was made last, and by tree which ones came after it
         self.last_tree: Any = None
         self.followers: defaultdict[Any, set[Any]] = defaultdict(set)

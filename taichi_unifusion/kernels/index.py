@@ -24,6 +24,11 @@ class Index:
     block: ti.Field  # its block number among theirs, plus one; 0 when they are fused
     leaf_parent: ti.SNode  # the node above the leaves
 
+    @property
+    def leaves(self) -> int:
+        """4^3 leaves that memory was taken for, those included that were given back."""
+        return int(self.leaf_parent._num_dynamically_allocated)
+
 
 @ti.func
 def find(index: ti.template(), ijk: ti.template()) -> ti.i32:
@@ -243,7 +248,7 @@ def count_leaves(
     # in:
     index: ti.template(),
 ) -> ti.i32:
-    """Number of 4^3 leaves that an index tree has allocated."""
+    """Number of 4^3 leaves that are in use."""
     leaves = 0
     for _ in ti.grouped(index.leaf_parent):
         leaves += 1

@@ -54,14 +54,12 @@ class VoxelGrid:
         self.packed = 0  # how often `retain` gave voxels other slots
         self.frame = 0
         self.unclosed: Any = None  # `CellArrays` with the keys of the voxels that are touched now
-        self.index, self._leaves = self._borrow_tree()
+        self.index = self._borrow_tree()
         largest = max(field.bytes for field in self.fields)
         least = min(LEAST_CAPACITY, max(LEAST_BYTES // largest, 1))
         capacity = min(max(FIRST_BYTES // largest, least), FIRST_CAPACITY)
         self._pools = {field.name: Pool(field, capacity) for field in (KEYS, *self.fields)}
-        self._touched = 0  # voxels since the leaves were counted
-        self._inherited = self.runtime.earlier.get(self.index, 0)
-        self._note_leaves()
+        self.recount()
         self.runtime.grids.add(self)
 
     def __getitem__(self, name: str) -> DeviceArray:
@@ -79,10 +77,9 @@ class VoxelGrid:
         """Voxels that there is room for."""
         return self._pools["keys"].capacity
 
-    def _borrow_tree(self) -> tuple[kernels.Index, int]:
-        """An index tree without voxels, and its leaves: one that a map no longer uses, else a new one,
-        because Taichi never frees the memory of a tree. Raises CapacityError where another one would
-        not be safe.
+    def _borrow_tree(self) -> kernels.Index:
+        """An index tree without voxels: one that a map no longer uses, else a new one, because Taichi
+        never frees the memory of a tree. Raises CapacityError where another one would not be safe.
         """
         free = self.runtime.free_trees
         alike = any(fields == self.fields for fields, _ in free)
@@ -90,12 +87,9 @@ class VoxelGrid:
             # maps that only a cycle holds, as the traceback of a run that failed: compiling kernels for
             # another tree takes seconds
             gc.collect()
-        leaves = 0
         if free:
             _, tree = free.pop(self._most_alike(free))
-            leaves = int(kernels.count_leaves(tree))
-            self.runtime.earlier[tree] = max(self.runtime.earlier.get(tree, 0), leaves)
-            leaves = _clear_tree(self.runtime, tree, leaves)
+            _empty_tree(tree, _is_crowded(self.runtime, tree))
         else:
             self.runtime.count_tree()
             if _too_large(self.runtime):
@@ -111,7 +105,7 @@ class VoxelGrid:
         weakref.finalize(self, free.append, (self.fields, tree))
         self.runtime.followers[self.runtime.last_tree].add(tree)
         self.runtime.last_tree = tree
-        return tree, leaves
+        return tree
 
     def _most_alike(self, free: Sequence[tuple[tuple[VoxelField, ...], kernels.Index]]) -> int:
         """The place of a tree for which kernels are compiled already: that of an equal map, or,
@@ -155,13 +149,14 @@ class VoxelGrid:
             )
 
     def recount(self) -> None:
-        """Count the leaves of the index tree."""
-        self._leaves, self._touched = self._count_leaves(), 0
+        """Count the leaves of the index tree, those of earlier maps included."""
+        runtime.check_alive(self.runtime)
+        self._leaves, self._touched = self.index.leaves, 0  # voxels touched since they were counted
         self._note_leaves()
 
     def _note_leaves(self) -> None:
-        """What the tree has now, at most; memory that it had for an earlier map stays with it."""
-        self.runtime.leaves[self.index] = max(self._inherited, self._leaves + self._touched)
+        """What the tree has now, at most."""
+        self.runtime.leaves[self.index] = self._leaves + self._touched
 
     def _alone_too_large(self, spare: int) -> bool:
         return (self._leaves + self._touched + spare) * BYTES_PER_LEAF > SPARSE_LIMIT
@@ -289,9 +284,7 @@ class VoxelGrid:
         and of the index serves the next ones. No frame may be summed up meanwhile.
         """
         runtime.check_alive(self.runtime)
-        self.recount()
-        self._inherited = max(self._inherited, self._leaves)
-        crowded = _is_crowded(self.runtime, self._leaves)
+        crowded = _is_crowded(self.runtime, self.index)
         if not crowded:  # a few voxels of a tree that keeps all its nodes: quicker than emptying it
             gone = self.rows(KEYS.name, np.setdiff1d(self.used_slots(), slots, assume_unique=True))
             if len(gone):
@@ -299,13 +292,12 @@ class VoxelGrid:
         for pool in self._pools.values():
             pool.move_down(slots, self.count)
         if crowded:
-            _clear_tree(self.runtime, self.index, self._leaves)
+            _empty_tree(self.index, crowded)
         self.count, self.empty, self.packed = len(slots), 0, self.packed + 1
         if len(slots):
             kept = self._pools[KEYS.name].take(np.arange(len(slots), dtype=np.int32))
             kernels.assign_slots(kept, 0, self.index)
-        if crowded:
-            self.recount()
+        self.recount()
 
     @property
     def row_bytes(self) -> int:
@@ -315,17 +307,14 @@ class VoxelGrid:
     @property
     def index_bytes(self) -> int:
         """Bytes that the index tree takes; nodes that were given back stay in Taichi's pool."""
-        return max(self._inherited, self._count_leaves()) * BYTES_PER_LEAF
+        runtime.check_alive(self.runtime)
+        return self.index.leaves * BYTES_PER_LEAF
 
     @property
     def memory_bytes(self) -> int:
         """Bytes that the voxels need: pools as far as they are used, and the index tree."""
         runtime.check_alive(self.runtime)
         return self.count * self.row_bytes + _leaves_of(self.voxel_keys()) * BYTES_PER_LEAF
-
-    def _count_leaves(self) -> int:
-        runtime.check_alive(self.runtime)
-        return int(kernels.count_leaves(self.index))
 
 
 def _index_bytes(live: runtime.Runtime) -> int:
@@ -353,7 +342,7 @@ def _recount(live: runtime.Runtime) -> None:
     for grid in live.grids:
         grid.recount()
     for _, tree in live.free_trees:
-        live.leaves[tree] = max(live.earlier.get(tree, 0), int(kernels.count_leaves(tree)))
+        live.leaves[tree] = tree.leaves
 
 
 def _leaves_of(keys: NDArray[np.int32]) -> int:
@@ -361,25 +350,26 @@ def _leaves_of(keys: NDArray[np.int32]) -> int:
     return len(np.unique((keys.astype(np.int64) + kernels.INDEX_HALF) // 4 @ LEAF_CODE))
 
 
-def _clear_tree(live: runtime.Runtime, tree: kernels.Index, leaves: int) -> int:
-    """Take all voxels out of an index tree of so many leaves, and count those that stay.
+def _is_crowded(live: runtime.Runtime, tree: kernels.Index) -> bool:
+    """Whether an index tree gives its nodes back when it is emptied: on the CPU (taichi#6401), where
+    they are many, or where the tree has more than half of its share of what is safe.
 
-    Its memory stays with it, its nodes at their places: nodes that are given back again and again
-    while other maps live have crashed processes. They are given back, on the CPU (taichi#6401), only
-    where there are many, or where the tree has more than half of its share of what is safe.
+    The memory of others stays with them, their nodes at their places: nodes that are given back again
+    and again while other maps live have crashed processes.
     """
-    kernels.clear_index(tree)
-    if not _is_crowded(live, leaves):
-        return leaves
-    topmost: Any = tree.leaf_parent.parent(2)  # pointer node
-    topmost.deactivate_all()
-    return 0
-
-
-def _is_crowded(live: runtime.Runtime, leaves: int) -> bool:
-    """Whether an index tree of so many leaves gives its nodes back when it is emptied."""
     share = (SPARSE_POOL - live.trees * BYTES_PER_TREE) / live.trees
-    return live.device == "cpu" and leaves * BYTES_PER_LEAF > min(CROWDED, share / 2)
+    room = min(CROWDED, share / 2)
+    if live.device != "cpu" or tree.leaves * BYTES_PER_LEAF <= room:
+        return False
+    return kernels.count_leaves(tree) * BYTES_PER_LEAF > room
+
+
+def _empty_tree(tree: kernels.Index, crowded: bool) -> None:
+    """Take all voxels out of an index tree; where it is crowded, its nodes apart, to be used again."""
+    kernels.clear_index(tree)
+    if crowded:
+        topmost: Any = tree.leaf_parent.parent(2)  # pointer node
+        topmost.deactivate_all()
 
 
 def _build_tree() -> kernels.Index:

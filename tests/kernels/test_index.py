@@ -169,10 +169,12 @@ def test_count_leaves_counts_4x4x4_groups_of_voxels(monkeypatch):
     gc.collect()
     monkeypatch.setattr(voxel_grid, "CROWDED", 0)  # a tree that was used before gives nodes back
     grid = a_grid()
+    before = grid.index.leaves  # those of maps before are used again
     assert kernels.count_leaves(grid.index) == 0
     keys = np.array([[0, 0, 0], [3, 3, 3], [4, 0, 0], [-1, 0, 0], [8191, -8192, 8191]])
     touch(grid, ((keys[:4] + 0.5) * VS).astype(np.float32))
     assert kernels.count_leaves(grid.index) == len(np.unique(keys[:4] // 4, axis=0)) == 3
+    assert grid.index.leaves == max(before, 3)
 
 
 def test_forty_maps_one_after_the_other_share_a_tree_that_starts_empty(cloud):
@@ -219,7 +221,8 @@ def test_an_index_that_would_pass_safe_memory_is_refused(monkeypatch):
     )
     ones, slots = np.ones(len(keys), np.float32), np.empty(len(keys), np.int32)
     assert grid.claim(len(keys), keys, ones, slots) == len(keys)
-    monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * (len(keys) - 1))
+    leaves = grid.index.leaves  # that a map before took are used again
+    monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * (leaves - 1))
     with pytest.raises(CapacityError, match="3,375 voxels .* larger voxels or save"):
         grid.claim(len(keys), keys + 400, ones, slots)
     assert grid.count == len(keys)
@@ -257,16 +260,17 @@ def test_what_a_map_that_is_gone_touched_again_and_again_counts_once():
     live = runtime.current()
     others = [a_grid() for _ in live.free_trees]  # so that its tree is the only free one
     grid = a_grid()
-    index, before = grid.index, live.earlier.get(grid.index, 0)
+    index = grid.index
     points = np.random.default_rng(5).uniform(-200, 200, (1000, 3)).astype(np.float32)
     for _ in range(9):
         keys = touch(grid, points)
         grid.claim(len(keys), keys, np.ones(len(keys), np.float32), np.empty(len(keys), np.int32))
     counted = kernels.count_leaves(index)
+    assert index.leaves == counted  # of a new tree, which never gave any back
     assert live.leaves[index] >= 8 * len(keys) + counted > counted
     del grid
     again = a_grid()
-    assert again.index is index and live.leaves[index] == max(before, counted)
+    assert again.index is index and live.leaves[index] == counted
     assert all(other.index is not index for other in others)
 
 
@@ -283,7 +287,6 @@ def like_cuda(monkeypatch):
 def test_the_pool_of_a_gpu_is_not_run_over(like_cuda, monkeypatch):
     """It is counted by whole chunks, and keeps room for what a frame adds before it is counted."""
     monkeypatch.setattr(like_cuda, "leaves", {})
-    monkeypatch.setattr(like_cuda, "earlier", {})
     grid, rng = a_grid(), np.random.default_rng(21)  # other places than those of tests before
     grid.recount()  # a tree that was used before keeps its nodes
     monkeypatch.setattr(voxel_grid, "NODES_PER_CHUNK", 1000)
@@ -333,7 +336,8 @@ def test_lone_points_that_make_no_voxel_also_count_against_safe_memory(monkeypat
     """Every touched voxel takes sparse memory, also where too few points fell to encode it."""
     grid = a_grid()
     rng = np.random.default_rng(8)
-    monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * 5000)
+    leaves = grid.index.leaves + 5000
+    monkeypatch.setattr(voxel_grid, "SPARSE_LIMIT", voxel_grid.BYTES_PER_LEAF * leaves)
     with pytest.raises(CapacityError, match="larger voxels or save"):
         for _ in range(20):
             keys = touch(grid, rng.uniform(-200, 200, (1000, 3)).astype(np.float32))
