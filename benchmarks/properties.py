@@ -29,6 +29,7 @@ from taichi_unifusion.maps import PropertyGroup
 from taichi_unifusion.properties import SurfaceProperty, make_property
 
 STYLES, SHOWN_STYLE = ("painting", "opencv", "sketch"), "sketch"
+VOXEL_SIZE = 0.1  # [m] of every property's map in the table of costs
 # Table VIII, a GPU, 1280x720
 PAPER_MS = {"surface": 100, "color": 38, "infrared": 45, "style": 48, "saliency": 45}
 
@@ -61,6 +62,11 @@ def timed(work: Callable, *arguments) -> float:
     return 1e3 * (clock() - start)
 
 
+def alike(surface_property: SurfaceProperty) -> uf.PropertyMap:
+    """A map for a property with voxels as large as those of the paper's Table VIII."""
+    return uf.PropertyMap(surface_property.name, surface_property.channels, voxel_size=VOXEL_SIZE)
+
+
 def cost(frames: int) -> None:
     """A table of milliseconds a frame by map."""
     properties = [make_property(name) for name in ("infrared", "style", "saliency")]
@@ -69,14 +75,9 @@ def cost(frames: int) -> None:
     maps = {
         "surface": uf.SurfaceMap(),
         "color": uf.PropertyMap("color", 3),
-        **{
-            each.name: uf.PropertyMap(each.name, each.channels, each.settings)
-            for each in properties
-        },
+        **{each.name: alike(each) for each in properties},
     }
-    group = PropertyGroup(
-        [uf.PropertyMap(each.name, each.channels, each.settings) for each in properties]
-    )
+    group = PropertyGroup([alike(each) for each in properties])
     laps: dict[str, list[float]] = {}
     for cloud in clouds:
         for name, target in maps.items():
@@ -91,7 +92,7 @@ def cost(frames: int) -> None:
     for name, values in laps.items():
         table.add_row(
             name,
-            sizes.get(name, "10 cm"),
+            sizes.get(name, sizes["infrared"]),
             f"{np.median(values[2:]):.1f}",
             str(PAPER_MS.get(name, sum(PAPER_MS[each.name] for each in properties))),
         )

@@ -26,6 +26,7 @@ class Arena:
 
     def __init__(self) -> None:
         self._arrays: dict[tuple, Any] = {}
+        self._asked: dict[tuple, int] = {}  # rows that somebody wanted last, of those that may grow
         self._turn = 0
 
     def borrow(self, name: str, dtype: Any, shape: tuple[int, ...]) -> DeviceArray:
@@ -37,7 +38,19 @@ class Arena:
         if known is None or known.shape[0] < shape[0]:
             rows = grown(known.shape[0] if known is not None else shape[0], shape[0])
             self._arrays[key] = ti.ndarray(dtype, (rows, *shape[1:]))
+        self._asked[key] = shape[0]
         return self._arrays[key]
+
+    def grow_ahead(self) -> None:
+        """Make more room where two thirds of it were asked for, while nothing is on loan: whoever asks
+        for more then does not wait for it.
+        """
+        import taichi as ti
+
+        for key, asked in self._asked.items():
+            array = self._arrays[key]
+            if 3 * asked > 2 * array.shape[0]:
+                self._arrays[key] = ti.ndarray(array.dtype, (2 * array.shape[0], *array.shape[1:]))
 
     def exact(self, name: str, make: Callable[[], Any], shape: tuple[int, ...]) -> Any:
         """What `make` makes, once for every use `name` and shape."""

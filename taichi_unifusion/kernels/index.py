@@ -27,7 +27,7 @@ class Index:
     @property
     def leaves(self) -> int:
         """4^3 leaves that memory was taken for, those included that were given back."""
-        return int(self.leaf_parent._num_dynamically_allocated)
+        return int(self.leaf_parent._num_dynamically_allocated)  # noqa: SLF001 - no kernel to compile
 
 
 @ti.func

@@ -67,11 +67,10 @@ def find_regions(
     certain = relevance >= threshold
     inside = certain | (extent >= threshold)
     areas = vertex_areas(mesh.vertices, mesh.faces)
-    pieces = []
-    for piece in _connected(mesh, inside):
-        sure = areas[piece[certain[piece]]].sum()
-        if sure > 0 and (sure >= min_area or sure >= CERTAIN * areas[piece].sum()):
-            pieces.append(piece)
+    vertices, part = _connected(mesh, inside)
+    sure, whole = (np.bincount(part, each[vertices]) for each in (areas * certain, areas))
+    kept = (sure > 0) & ((sure >= min_area) | (sure >= CERTAIN * whole))
+    pieces = _split(vertices[kept[part]], part[kept[part]])
     if join > 0:
         pieces = join_pieces(mesh, pieces, areas, join)
     regions = [
@@ -142,22 +141,29 @@ def _boxes_that_meet(low: NDArray, high: NDArray) -> list[tuple[int, int]]:
     return pairs
 
 
-def _connected(mesh: Mesh, inside: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """The vertices of each connected part of the surface between vertices inside (V,)."""
+def _connected(
+    mesh: Mesh, inside: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The vertices inside (V,), and for each the number of its connected part of the surface there."""
     runtime.current()  # before Taichi is imported: it says what it starts
     from ..maps.meshing import connected_parts
 
-    vertices = np.flatnonzero(inside)
-    if not len(vertices):
-        return []
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     edges = edges[inside[edges].all(axis=1)]
     count = len(mesh.vertices)
     part = np.arange(count)
     if len(edges):
         part = connected_parts(np.ascontiguousarray(edges[:, [0, 1, 1]]), count)
-    order = vertices[np.argsort(part[vertices], kind="stable")]
-    return np.split(order, np.flatnonzero(np.diff(part[order])) + 1)
+    vertices = np.flatnonzero(inside)
+    return vertices, np.unique(part[vertices], return_inverse=True)[1]
+
+
+def _split(vertices: NDArray[np.int64], part: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """The vertices of each part, in ascending order."""
+    if not len(vertices):
+        return []
+    order = np.argsort(part, kind="stable")
+    return np.split(vertices[order], np.flatnonzero(np.diff(part[order])) + 1)
 
 
 def _region(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,8 +49,19 @@ class Part:
         """
         for each in self.maps:
             own = touched if each is self.maps[0] else blocks
-            spread = SPREAD if isinstance(self.binner, SurfelBinner) else 0
-            each.grid.expect((1 + spread) * blocks, spread * blocks, own)
+            more = self._most_voxels(blocks)
+            each.grid.expect(more, more - blocks, own)
+
+    def grow_ahead(self, blocks: int) -> list[Callable[[], None]]:
+        """What makes room, a pool at a time, for what a window of so many blocks adds and for another
+        one like it; by expectation, since most of their voxels are the same.
+        """
+        extra = 3 * self._most_voxels(blocks) // 2
+        return [grow for each in self.maps for grow in each.grid.grow_ahead(extra)]
+
+    def _most_voxels(self, blocks: int) -> int:
+        """How many voxels a window of so many blocks may add to a map."""
+        return (1 + (SPREAD if isinstance(self.binner, SurfelBinner) else 0)) * blocks
 
     def fuse(self, local: LocalLim) -> dict[str, int]:
         """Fuse to each map its part; by name how many voxels that were."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gc
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -175,17 +175,36 @@ class VoxelGrid:
         self.note_touched(touched, spare=untouched)
         self._make_room(extra)
 
+    def grow_ahead(self, extra: int) -> list[Callable[[], None]]:
+        """What makes room for `extra` more voxels, a pool at a time, so that no frame waits for all of
+        them; nothing where there is room, or where there can be no more.
+        """
+        rows = self._rows_for(extra)
+        try:
+            self._check_room(rows)
+        except CapacityError:  # said when it is needed
+            return []
+        # the keys' pool last, by which it is said how many voxels there is room for
+        pools = [*self._pools.values()][::-1] if rows > self.capacity else []
+        return [lambda pool=pool: pool.reserve(rows, self.count) for pool in pools]
+
     def _make_room(self, extra: int) -> None:
-        needed = self.count + extra
-        if needed <= self.capacity:
-            return
-        rows = grown(self.capacity, needed)
-        if self.capacity >= LARGE:
-            rows = max(self.capacity + self.capacity // 4, needed)
-        for pool in self._pools.values():  # what does not fit is said before the first one changes
-            pool.check_room(rows, len(self))
+        rows = self._rows_for(extra)
+        self._check_room(rows)
         for pool in self._pools.values():
             pool.reserve(rows, self.count)
+
+    def _rows_for(self, extra: int) -> int:
+        """Voxels that there should be room for where `extra` more come."""
+        needed = self.count + extra
+        if needed <= self.capacity or self.capacity < LARGE:
+            return grown(self.capacity, needed)
+        return max(self.capacity + self.capacity // 4, needed)
+
+    def _check_room(self, rows: int) -> None:
+        """Raise CapacityError where a pool cannot have so many rows, before the first one changes."""
+        for pool in self._pools.values():
+            pool.check_room(rows, len(self))
 
     def claim(
         self, blocks: int, keys: DeviceArray, weights: DeviceArray, slots: DeviceArray

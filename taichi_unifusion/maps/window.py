@@ -189,6 +189,13 @@ class Window:
         kept = {} if keep is None else self.parts
         cells = {names: each.kept_cells() for names, each in kept.items()}
         pieces = [piece for each in self.parts.values() for piece in self._pieces(each)]
+        growth = [
+            Piece(" + ".join(names), grow)
+            for names, each in self.parts.items()
+            for grow in each.part.grow_ahead(each.cells.count)
+        ]
+        for n, piece in enumerate(growth, 1):  # so that no frame does several of them
+            pieces.insert(n * len(pieces) // (len(growth) + 1), piece)
         if keep is not None:
             pieces.append(Piece("keep", lambda: keep(self._kept(cells))))
         return pieces
@@ -226,6 +233,7 @@ class Window:
                 ends = np.linspace(0.0, 1.0 if binned.count else 0.0, VOTE_PIECES + 1)
                 for share in pairwise(ends):
                     yield Piece(name, partial(self._vote, each, share))
+        yield Piece(name, part.arena.grow_ahead)
 
     def _vote(self, surface: SurfaceMap, share: tuple[float, float]) -> None:
         """Let all views vote in a share of the voxels of a map, from and to."""

@@ -25,8 +25,11 @@ from windows import (
 )
 
 from taichi_unifusion import preprocess
+from taichi_unifusion.device_arrays import Arena
 from taichi_unifusion.errors import CapacityError, OutOfRange
+from taichi_unifusion.kernels import ti
 from taichi_unifusion.maps import PropertyMap, SurfaceMap, local_lim, voxel_grid, window
+from taichi_unifusion.maps.pool import Pool
 from taichi_unifusion.pipeline import Pipeline
 from taichi_unifusion.run_log import EmptyFrame
 
@@ -263,3 +266,40 @@ def test_no_frame_waits_for_more_than_its_share_and_all_is_fused_before_the_next
         if n % 4 == 2:
             assert left == 0
     assert max(counts) < sum(counts) / 5
+
+
+def test_a_map_grows_before_a_frame_has_to_wait_and_not_all_of_it_in_one(frames, monkeypatch):
+    """Pools that are too small for the second window grow by pieces of the first one; the map is that
+    of pools that had room from the start.
+    """
+    fused = contents(stepped(frames))
+    monkeypatch.setattr(voxel_grid, "FIRST_CAPACITY", 3400)
+    done, grown, reserve = [], [], Pool.reserve
+
+    def recorded(pool: Pool, rows: int, used: int) -> None:
+        if rows > pool.capacity:
+            grown.append((len(done), pool.field.name))
+        reserve(pool, rows, used)
+
+    monkeypatch.setattr(Pool, "reserve", recorded)
+    pipeline = Pipeline(CONFIG)
+    for frame in frames:
+        pipeline.step(frame)
+        done.append(frame)
+    assert contents(pipeline) == fused
+    fields = ["keys", *(field.name for field in pipeline.surface.grid.fields)]
+    assert [name for _, name in grown] == fields[::-1]  # the keys last: they say how many
+    by_frame = [sum(at == n for at, _ in grown) for n in (4, 5, 6)]
+    assert sum(by_frame) == len(fields) and max(by_frame) <= len(fields) // 3 + 1
+
+
+def test_an_arena_makes_more_room_before_it_is_asked_for():
+    arena = Arena()
+    first = arena.borrow("averages", ti.f32, (90, 4))
+    arena.grow_ahead()
+    second = arena.borrow("averages", ti.f32, (120, 4))
+    assert (first.shape, second.shape) == ((90, 4), (180, 4))
+    arena.grow_ahead()  # two thirds are in use: enough
+    assert arena.borrow("averages", ti.f32, (180, 4)) is second
+    arena.grow_ahead()
+    assert arena.borrow("averages", ti.f32, (1, 4)).shape == (360, 4)
