@@ -64,7 +64,9 @@ def inspect(path: Path) -> Inspection:
 
     checked = {file: attempt(_checked, file) for file in maps}
     stored = {file: each for file, each in checked.items() if each}
-    rows = [_describe_map(file, each) for file, each in stored.items()]
+    empty = {file for file in stored if record is not None and not stored[file].voxels}
+    empty &= set(RunFolder(path).safe_maps)  # of a run whose windows wait
+    rows = [_describe_map(file, each) for file, each in stored.items() if file not in empty]
     texts = [
         format_table([MAP_COLUMNS, *rows]) if rows else None,
         _describe_features(list(stored.values())),
@@ -152,9 +154,15 @@ def _describe_unfinished(file: Path) -> str | None:
     folder = RunFolder(file.parents[1])
     if (state := read_state(folder)) is None:
         return None
-    return (
+    text = (
         f"ended   {state.done} of {state.recipe.recording.frames} frames are safe in "
         f"{folder.relative(folder.unfinished)}/: the same command with --resume goes on from there"
+    )
+    if state.windows is None or not (waiting := state.windows.waiting):
+        return text
+    return (
+        f"{text}\nwaiting {waiting} window{'s' if waiting > 1 else ''} of frames, which the maps take in at "
+        "the end, when poses are final; `unifusion view` fuses them to show them"
     )
 
 

@@ -30,6 +30,7 @@ class StoredWindows:
     """How far the windows of a run were at a safe point."""
 
     bytes: int  # of their file
+    waiting: int = 0  # windows that are fused when poses are final
     first: int  # added to the places of frames of its windows
     settled: bool  # as `MapFollower.settled`
 
@@ -45,7 +46,10 @@ def keep_windows(folder: RunFolder, follower: MapFollower) -> StoredWindows | No
         store.sync()
     else:
         store.move(folder.safe_windows)
-    return StoredWindows(bytes=store.file_size, first=store.first, settled=follower.settled)
+    waiting = len(store) - sum(1 for _ in store.resident())
+    return StoredWindows(
+        bytes=store.file_size, waiting=waiting, first=store.first, settled=follower.settled
+    )
 
 
 def windows_then(folder: RunFolder, then: StoredWindows) -> WindowStore:

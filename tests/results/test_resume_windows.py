@@ -84,6 +84,13 @@ def test_R7_a_run_that_keeps_windows_goes_on_after_every_death(
     state = read_state(out)
     assert state.done == 3 and out.safe_windows.stat().st_size >= state.windows.bytes > 1e4
     assert len(mesh_of_safe_point(out).faces) > 100  # of windows that wait, too
+    capsys.readouterr()
+    assert main(["info", str(out.path)]) == 0
+    said = capsys.readouterr().out
+    waits = words == ONE_PASS
+    assert "3 of 11 frames are safe" in said
+    assert ("waiting 1 window" in said, state.windows.waiting) == (waits, waits)
+    assert ("Matern" in said) != waits  # no row of a map that nothing was fused into
     with out.safe_windows.open("ab") as file:
         file.write(b"half of a window")
     killed(monkeypatch, saver, "write_state", 2, out.path, *words, "--resume")
