@@ -46,7 +46,7 @@ class Addition:
 def check_into(options: RunOptions, on_workers: bool) -> None:
     """Raise InputError for options that --into does not go with, FileError where there is no map."""
     from ..results.merging import SETTINGS
-    from ..results.reader import read_run
+    from ..results.record import read_record
     from ..results.run_folder import RunFolder
 
     output, into = options.output, options.output.into
@@ -57,7 +57,9 @@ def check_into(options: RunOptions, on_workers: bool) -> None:
             "--into: one process adds a recording to a map; leave --workers and --cluster out"
         )
     known, goes_on = RunFolder(into), output.resume and RunFolder(output.out).placement.exists()
-    before = settings_of(into) if goes_on else read_run(into).config()
+    before = settings_of(into)
+    if not goes_on:
+        read_record(known.record)
     _check_tiles(known, options)
     for name in SETTINGS:
         if getattr(options.settings, name) != getattr(before, name):
@@ -111,13 +113,16 @@ def maps_of(options: RunOptions, folder: RunFolder) -> dict[str, BaseMap] | None
     from .. import runtime
     from ..files.tiles import TileFolder
     from ..maps import load_map
-    from ..results.reader import read_run
+    from ..results.record import read_record
+    from ..results.run_folder import RunFolder
 
     if options.output.into is None:
         return None
     runtime.init(options.settings.device, threads=options.settings.threads or None)
     found = {}
-    for name, path in read_run(options.output.into).folder.maps.items():
+    known = RunFolder(options.output.into)
+    read_record(known.record)  # a run that was ended while it wrote has none
+    for name, path in known.maps.items():
         if TileFolder.is_one(path):
             TileFolder.open(path).snapshot(folder.working_tiles / name)
         else:
@@ -138,12 +143,20 @@ def remembered(
     files that are there then.
     """
     from ..results.keyframes import keyframes_of_run
-    from ..tracking.keyframe_file import write_keyframes
 
     in_file = store is not None and store.path is not None
     if not run.steps or not (in_file or added):
         return ()
     found = added.keyframes if added else keyframes_of_run(frames, run, config, stop)
+    return keep_keyframes(folder, found)
+
+
+def keep_keyframes(folder: RunFolder, found: Keyframes | None) -> tuple[Path, ...]:
+    """Write keyframes, if there are any; the files that are there then."""
+    from ..tracking.keyframe_file import write_keyframes
+
+    if not found:
+        return ()
     size = write_keyframes(folder.new_keyframes, found)
     folder.new_keyframes.replace(folder.keyframes)
     logger.info(
@@ -193,7 +206,7 @@ def _found(
     from ..geometry import se3
     from ..results.keyframes import depth_range, known_keyframes
     from ..results.placement import Placement
-    from ..results.reader import read_run
+    from ..results.reader import sources_of
     from ..results.run_folder import RunFolder
     from ..tracking.joining import join, keyframes_of
 
@@ -214,12 +227,11 @@ def _found(
     for keyframe, T in zip(new.items, joined.T_known_keyframe, strict=True):
         known.append(keyframe, T)
     folder = RunFolder(options.output.into)
-    source = read_run(folder.path).source
     placement = Placement(
         tuple(keyframe.index for keyframe in new.items),
         motion,
         {"joined": details_of(joined, folder.path, len(new))},
-        (*source.before, replace(source, before=())),
+        sources_of(folder),
     )
     return placement, known
 

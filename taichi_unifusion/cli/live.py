@@ -20,6 +20,7 @@ from ..tracking.live import warm_up as warm_up_tracker
 from .color_camera import AUTO, given_color
 from .following import following, keep_store, open_store, settle
 from .interrupts import INTERRUPTED
+from .into import keep_keyframes
 from .options import (
     OutputOptions,
     RecordingOptions,
@@ -170,7 +171,9 @@ def _map(
     result = tracker.finish()
     run = settle(pipeline, run, tracker.current_poses())
     written = _write_tracking(folder, result) if source.tracking != "given" else ()
-    written = (*written, *keep_store(folder, store, output))
+    written = (*written, *(windows := keep_store(folder, store, output)))
+    if windows:
+        written = (*written, *keep_keyframes(folder, tracker.keyframes()))
     details = {
         **result.details,
         "mode": source.tracking,

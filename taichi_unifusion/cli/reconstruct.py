@@ -79,7 +79,10 @@ class Reconstruct:
 def reconstruct(options: Reconstruct) -> int:
     """Frames -> maps -> mesh -> results folder."""
     if options.live.live and options.output.into is not None:
-        raise InputError("--into: not with --live yet; record first, and add the recording")
+        raise InputError(
+            "--into: not with --live, whose map begins before its place in the other is known; leave it out, "
+            "and bring both together afterwards: unifusion merge DIR LIVE --align --out BOTH"
+        )
     if options.live.live:
         return reconstruct_live(
             options.recording,

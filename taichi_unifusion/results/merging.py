@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import Config
+from ..config import Config, load_config
 from ..errors import FileError, InputError
 from ..files.tiles import map_bytes
 from ..geometry import se3
@@ -23,7 +23,7 @@ from ..tracking.joining import Joined, join
 from ..tracking.keyframe_file import write_keyframes
 from ..tracking.keyframes import Keyframes
 from .keyframes import known_keyframes
-from .reader import read_run
+from .reader import sources_of
 from .record import MapRecord, read_record, write_record
 from .reposing import read_windows
 from .run_folder import RunFolder
@@ -44,9 +44,9 @@ class Aligned:
 
 def check_same_maps(folders: list[RunFolder]) -> Config:
     """The settings that all runs share; raises InputError where their maps cannot be added up."""
-    first = read_run(folders[0].path).config()
+    first = load_config(folders[0].config)
     for folder in folders:
-        config = read_run(folder.path).config()
+        config = load_config(folder.config)
         if config.map_memory:
             raise InputError(
                 f"merge: {folder.path} holds maps in tiles, which cannot be aligned yet"
@@ -93,8 +93,8 @@ def record_all(
 ) -> None:
     """Write the record of the merged map: that of the first run, with the others' recordings."""
     record = read_record(out.record)
-    sources = [read_run(folder.path).source for folder in folders]
-    others = [each for s in sources[1:] for each in (*s.before, replace(s, before=()))]
+    others = [source for folder in folders[1:] for source in sources_of(folder)]
+    first = record.recording  # None: of a camera
     sizes = {
         name: MapRecord(
             each.voxel_size, len(each.grid), each.memory_bytes, map_bytes(out.map(name))
@@ -106,7 +106,7 @@ def record_all(
         out.record,
         replace(
             record,
-            recording=replace(sources[0], before=(*sources[0].before, *others)),
+            recording=first and replace(first, before=(*first.before, *others)),
             tracking={**(record.tracking or {"mode": "given"}), "merged": list(map(_said, added))},
             maps=sizes,
             files={name: (out.path / name).stat().st_size for name in files},

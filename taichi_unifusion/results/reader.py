@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from .record import ColorRecord, Source, read_record
 from .run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
+CAMERA = "camera"  # in the place of a format
 
 
 @dataclass(frozen=True)
@@ -165,6 +166,17 @@ def registered_as(recording: Dataset, color: ColorRecord | None) -> Dataset:
     return recording.with_color_camera(
         ColorCamera.from_values(color.camera, "the record of the run")
     )
+
+
+def sources_of(folder: RunFolder) -> tuple[Source, ...]:
+    """The recordings that maps were made from, in order; CAMERA is the format of one that came live from a
+    camera. Raises FileError where there is no record, or a damaged one.
+    """
+    record = read_record(folder.record)
+    if (source := record.recording) is not None:
+        return (*source.before, replace(source, before=()))
+    seen = record.frames.used + len(record.frames.skipped_frames)
+    return (Source(format=CAMERA, path="", start=0, end=None, every=1, frames=seen),)
 
 
 def find_run(path: Path) -> Run | None:

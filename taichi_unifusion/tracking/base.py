@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from ..errors import InputError, PoseError, check_types, strict
 from ..geometry import se3
 from ..preprocessing import PreprocessSettings
 from ..types import Frame, Trajectory
+
+if TYPE_CHECKING:
+    from .keyframes import Keyframes
 
 
 @strict
@@ -242,6 +245,12 @@ class Tracker(ABC):
         bear being asked early.
         """
         return CurrentPoses.fixed(self.finish().frames)
+
+    def keyframes(self) -> Keyframes | None:
+        """What another recording of the place can be aligned to, at their present poses; None: the tracker
+        keeps none.
+        """
+        return None
 
     @abstractmethod
     def finish(self) -> TrackingResult:

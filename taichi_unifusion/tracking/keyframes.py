@@ -89,6 +89,14 @@ class Keyframes:
         self.T_world_keyframe.append(T_world_keyframe)
         return len(self.items) - 1
 
+    def of_first_map(self) -> Keyframes:
+        """Those of the first sub-map, whose is the world, with those of all that joined it."""
+        found = Keyframes()
+        for number, island in enumerate(self.islands):
+            if not island:
+                found.append(self.items[number], self.T_world_keyframe[number])
+        return found
+
     def correct(self, bias: NDArray[np.float64]) -> None:
         """Correct the depth of all keyframes, as `DepthBias` found it to be wrong."""
         self.items = [corrected_keyframe(each, bias) for each in self.items]

@@ -29,6 +29,7 @@ from .base import (
 from .features import locate, most_similar
 from .fixed_part import FixedPart, without
 from .islands import Islands
+from .keyframes import Keyframes
 from .loop_closure import believable
 from .odometry import (
     FRAME_AGREEMENT,
@@ -156,6 +157,9 @@ class RgbdTracker(Tracker):
 
     def current_poses(self) -> CurrentPoses:
         return self.odometry.current_poses()
+
+    def keyframes(self) -> Keyframes:
+        return self.odometry.keyframes.of_first_map()
 
     def finish(self) -> TrackingResult:
         return self.odometry.result()

@@ -11,7 +11,7 @@ import pytest
 from killing import killed_at
 from scipy.spatial import cKDTree
 
-from taichi_unifusion.cli import viewing
+from taichi_unifusion.cli import live, viewing
 from taichi_unifusion.cli.main import main
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
 from taichi_unifusion.files.mesh_reading import read_mesh
@@ -21,8 +21,9 @@ from taichi_unifusion.geometry import se3
 from taichi_unifusion.maps.stored import read_stored
 from taichi_unifusion.maps.window_store import WindowStore
 from taichi_unifusion.pipeline import Pipeline
-from taichi_unifusion.results import read_record
+from taichi_unifusion.results import read_record, saver
 from taichi_unifusion.results.folder_writer import FolderWriter
+from taichi_unifusion.results.reader import CAMERA
 from taichi_unifusion.results.run_folder import RunFolder
 from taichi_unifusion.tracking.keyframe_file import read_keyframes
 from taichi_unifusion.viewer.live import ChangedChunks
@@ -122,6 +123,28 @@ def test_two_results_become_one_in_the_world_of_the_first(
     assert len(read_keyframes(out / "keyframes.log")) > len(
         read_keyframes(monday / "keyframes.log")
     )
+
+
+def test_what_came_from_a_camera_is_brought_together_by_its_own_keyframes(
+    monday, tmp_path, monkeypatch, capsys
+):
+    """Nobody can open its recording again: those of the tracker are kept."""
+    seen, out = tmp_path / "live", tmp_path / "merged"
+    with monkeypatch.context() as patch:
+        patch.setattr(live, "source_of", lambda *_: None)
+        words = [*SMALL, "--tracking", "rgbd", "--live", "--live-speed", "0.1"]
+        assert reconstruct(*words, "--out", str(seen), **SECOND) == 0
+    assert read_record(seen / "metrics.json").recording is None
+    poses = read_trajectory(seen / "tracking.txt").T_world_camera
+    kept = read_keyframes(seen / "keyframes.log")
+    for T in kept.T_world_keyframe:
+        assert min(se3.distance(T, each)[0] for each in poses) < 1e-6
+    words = ["merge", str(monday), str(seen), "--align", "--resolution", "2", "--out", str(out)]
+    assert main(words) == 0
+    assert "views were recognised" in capsys.readouterr().out
+    assert [each.format for each in read_record(out / "metrics.json").recording.before] == [CAMERA]
+    both = ["--into", str(seen), "--out", str(tmp_path / "both")]
+    assert reconstruct(*both, **SECOND) == 0  # a map from a camera is added to, too
 
 
 def test_worlds_that_are_not_the_same_are_not_added_up(monday, tuesday, tmp_path, capsys):
@@ -224,6 +247,28 @@ def test_a_run_that_is_ended_goes_on_in_the_folder_of_the_map(
     capsys.readouterr()
     assert reconstruct(*words, **SECOND) == 0
     assert "holds the whole run already" in capsys.readouterr().err
+
+
+def test_windows_of_both_recordings_survive_what_ends_a_run(monday, tmp_path, monkeypatch):
+    """While a safe point is made, while frames are fused, and while results are written."""
+    folder, whole = tmp_path / "results", tmp_path / "whole"
+    assert reconstruct("--into", str(monday), "--out", str(whole), **SECOND) == 0
+    shutil.copytree(monday, folder)
+    monkeypatch.setattr(saver, "SHARE", 1e9)  # safe points at every border
+    words = ["--into", str(folder), "--save-every", "1e-9"]
+    killed(monkeypatch, saver, "write_state", 1, *words, **SECOND)
+    words.append("--resume")
+    killed(monkeypatch, Pipeline, "step", 7, *words, **SECOND)
+    assert read_record(folder / "metrics.json").frames.used == 14  # as it was
+    killed(monkeypatch, FolderWriter, "write", 3, *words, **SECOND)
+    assert reconstruct(*words, **SECOND) == 0
+    assert voxels(folder) == voxels(whole)
+    ours, theirs = (WindowStore.open(each / "windows.log").windows for each in (folder, whole))
+    assert [kept.frames for kept in ours] == [kept.frames for kept in theirs]
+    assert [kept.record.checksum for kept in ours] == [kept.record.checksum for kept in theirs]
+    assert all(np.array_equal(a.place, b.place) for a, b in zip(ours, theirs, strict=True))
+    assert not RunFolder(folder).unfinished.exists() and not RunFolder(folder).temporaries
+    assert main(["info", str(folder)]) == 0
 
 
 def test_maps_in_tiles_are_added_to(monday, grown, tmp_path, monkeypatch):
