@@ -3,6 +3,7 @@ it out again, and four maps are compared: drifted, followed, fused at the correc
 the true poses.
 
     python benchmarks/loops.py --data ../shared/data --paths living --drifts 0.05
+    python benchmarks/loops.py --data ../shared/data --paths tour --drifts tracked     what our own tracker drifts by
     python benchmarks/loops.py --cycles 1000            no data: a window goes and comes back so often
     python benchmarks/loops.py --cost 7scenes redkitchen --end 150    what following adds to mapping a video
     python benchmarks/loops.py --kept synthetic kitchen     what keeping and moving does to a map; bytes
@@ -20,7 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from house import PATHS
+from house import PATHS, load_house
 from numpy.typing import NDArray
 from quality import DATA
 from quality_scenes import DEPTH_RANGE, SCENES, Scene, house
@@ -35,6 +36,8 @@ from taichi_unifusion.maps import BaseMap
 from taichi_unifusion.maps.voxel_data import VoxelData
 from taichi_unifusion.maps.window_store import WindowStore, to_record
 from taichi_unifusion.pipeline import Pipeline
+from taichi_unifusion.tracking import TrackingSettings, make_tracker
+from taichi_unifusion.tracking.rgbd import RgbdTracker
 from taichi_unifusion.types import Frame, Mesh
 
 WIGGLE = 0.2  # of the drift, across its direction, that no loop knows of
@@ -70,6 +73,32 @@ def with_drift(true: NDArray[np.float64], drift: float) -> Trajectories:
     end = se3.log(se3.inverse(at[-1]) @ error[-1] @ at[-1])
     undone = at @ se3.exp(-share[:, None] * end) @ se3.inverse(at)
     return Trajectories(true, drifted, se3.normalized(undone @ drifted))
+
+
+def tracked(path: str, data: Path, frames: Sequence[Frame]) -> Trajectories:
+    """Poses that our tracker finds without loops, and with them, from all frames of a path."""
+    recording = load_house(data / "aws-small-house", path)
+    true = np.array([frame.require_pose() for frame in frames])
+    found = []
+    for loops in (False, True):
+        tracker = RgbdTracker(TrackingSettings(loops=loops))
+        for i in range(len(recording)):
+            tracker.track(replace(recording[i], T_world_camera=None))
+        tracker.finish()
+        poses = tracker.current_poses().by_frame
+        T = np.array([poses[frame.index] for frame in frames])
+        found.append(se3.normalized(true[0] @ se3.inverse(T[0]) @ T))
+    return Trajectories(true, *found)
+
+
+def aligned(frames: Sequence[Frame]) -> NDArray[np.float64]:
+    """Poses (N, 4, 4) after all frames were aligned to those before, held near where they are."""
+    tracker = make_tracker("internal")
+    for frame in frames:
+        tracker.track(frame)
+    tracker.finish()
+    poses = tracker.current_poses().by_frame
+    return np.array([poses[frame.index] for frame in frames])
 
 
 def at_poses(frames: Sequence[Frame], poses: NDArray[np.float64]) -> list[Frame]:
@@ -174,9 +203,10 @@ def measure(run: Run, scene: Scene, poses: NDArray, true: NDArray) -> dict[str, 
     }
 
 
-def compare(scene: Scene, drift: float) -> dict[str, dict[str, float | None]]:
-    """The four maps of one path and drift."""
-    poses = with_drift(scene.T_world_camera, drift)
+def compare(
+    scene: Scene, drift: str, poses: Trajectories, align: bool
+) -> dict[str, dict[str, float | None]]:
+    """The four maps of one path and drift; with `align` a fifth, moved to where frames fit each other."""
     frames = list(scene.frames)
     rows: dict[str, dict[str, float | None]] = {}
 
@@ -185,12 +215,15 @@ def compare(scene: Scene, drift: float) -> dict[str, dict[str, float | None]]:
         cells = " | ".join(
             f"{key} {value:.3g}" for key, value in rows[name].items() if value is not None
         )
-        print(f"{scene.name} {100 * drift:g} cm | {name} | {cells}", flush=True)
+        print(f"{drift} | {name} | {cells}", flush=True)
 
     fuse(frames[:3], WindowStore())  # compiles
     drifted = fuse(at_poses(frames, poses.drifted), WindowStore())
     add("drifted", drifted, poses.drifted)
     add("followed", follow(drifted, frames, poses.corrected), poses.corrected)
+    if align:
+        better = aligned(at_poses(frames, poses.corrected))
+        add("aligned and followed", follow(drifted, frames, better), better)
     del drifted
     add("from scratch", fuse(at_poses(frames, poses.corrected), None), poses.corrected)
     add("true poses", fuse(frames, None), poses.true)
@@ -327,7 +360,12 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--paths", nargs="+", default=list(PATHS), choices=list(PATHS))
-    parser.add_argument("--drifts", nargs="+", type=float, default=[0.02, 0.05, 0.10])
+    parser.add_argument(
+        "--drifts", nargs="+", default=["0.02", "0.05", "0.10"], metavar="METRES|tracked"
+    )
+    parser.add_argument(
+        "--align", action="store_true", help="also align frames to each other after the loop"
+    )
     parser.add_argument("--frames", type=int, help="about how many frames (default: every 5th)")
     parser.add_argument("--cycles", type=int, help="only move one window so often")
     parser.add_argument(
@@ -344,7 +382,7 @@ def main() -> int:
         cycle(options.cycles)
         return 0
     if options.cost:
-        cost(*options.cost, options.data, options.end, options.drifts[0])
+        cost(*options.cost, options.data, options.end, float(options.drifts[0]))
         return 0
     if options.kept:
         for name in options.kept:
@@ -355,7 +393,13 @@ def main() -> int:
         scene = house(path, options.data, options.frames)
         scene = replace(scene, frames=[scene.frames[i] for i in range(len(scene.frames))])
         for drift in options.drifts:
-            results[f"{path} {drift:g}"] = compare(scene, drift)
+            poses = (
+                tracked(path, options.data, scene.frames)
+                if drift == "tracked"
+                else with_drift(scene.T_world_camera, float(drift))
+            )
+            name = f"{path} {drift}"
+            results[name] = compare(scene, name, poses, options.align)
             if options.out:
                 options.out.write_text(json.dumps(results, indent=1))
     return 0

@@ -44,7 +44,7 @@ def measure(name: str, method: str, data: Path) -> dict:
     )
     truth = {frame.index: frame.T_world_camera for frame in frames}
     ate, rpe = trajectory_error(poses, truth)
-    mean, median = map_error(frames, poses)
+    mean, median = (None, None) if stretch.exact else map_error(frames, poses)
     return {
         "frames": len(frames),
         "tracked": len(poses),
@@ -113,6 +113,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=DEFAULT, choices=[*METHODS, GIVEN])
     parser.add_argument("--stretches", nargs="+", default=list(STRETCHES), choices=list(STRETCHES))
     parser.add_argument("--minutes", type=float, default=15, help="begin no row after them")
+    parser.add_argument("--threads", type=int, help="CPU threads of Taichi (default: all)")
     parser.add_argument(
         "--row", nargs=2, metavar=("STRETCH", "METHOD"), help="measure one, write its file"
     )
@@ -120,7 +121,7 @@ def main() -> None:
     options.cache.mkdir(parents=True, exist_ok=True)
     if options.row:
         name, method = options.row
-        uf.init("cpu")
+        uf.init("cpu", threads=options.threads)
         found = json.dumps(measure(name, method, options.data), indent=1)
         (options.cache / f"{name}--{method}.json").write_text(found)
         return
@@ -131,6 +132,8 @@ def main() -> None:
             if not file.exists() and time.monotonic() < until:
                 # in a process of its own: Taichi does not give a map's memory back
                 row = [sys.executable, __file__, str(options.data), "--cache", str(options.cache)]
+                if options.threads:
+                    row += ["--threads", str(options.threads)]
                 subprocess.run([*row, "--row", name, method], check=False)
             if file.exists():
                 rows[name, method] = json.loads(file.read_text())
