@@ -70,7 +70,9 @@ def track(method: str, frames: uf.datasets.Dataset) -> tuple[dict[int, np.ndarra
 
 
 def table(rows: dict[tuple[str, str], dict], methods: Sequence[str]) -> str:
-    """Stretches down, methods across; worst and mean of those stretches that all methods have."""
+    """Stretches down, methods across; worst and mean of those stretches that all methods have which
+    have any of the kind.
+    """
     names = [name for name in STRETCHES if any((name, method) in rows for method in methods)]
     shown = [["stretch", "judged by", *methods]]
     for name in names:
@@ -78,14 +80,17 @@ def table(rows: dict[tuple[str, str], dict], methods: Sequence[str]) -> str:
         cells = [_cell(rows.get((name, method))) for method in methods]
         shown.append([name, "ATE" if kinds == {True} else "map", *cells])
     for exact, what in ((True, "ATE"), (False, "map")):
-        values = {
-            method: [
-                _value(row)
-                for (_, each), row in rows.items()
+        known = {
+            method: {
+                name: _value(row)
+                for (name, each), row in rows.items()
                 if each == method and row["exact"] is exact and _value(row) is not None
-            ]
+            }
             for method in methods
         }
+        having = [set(of) for of in known.values() if of]
+        common = set.intersection(*having) if having else set()
+        values = {m: [of[name] for name in of if name in common] for m, of in known.items()}
         for label, of in (("worst", max), ("mean", np.mean)):
             cells = [f"{of(values[m]):.2f}" if values[m] else "-" for m in methods]
             shown.append([label, what, *cells])

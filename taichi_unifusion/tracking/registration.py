@@ -18,7 +18,8 @@ GATES = (0.04, 0.08, 0.16)  # [m] farthest distance of an inlier from the other'
 USED_WIDTH = 160  # [px] a wider source image is thinned to at least this many pixels a row
 MAX_ANGLE = 25.0  # [degrees] between the normals of inliers
 ROBUST_WIDTH = 1.0  # [standard deviations] a distance that counts half
-CONVERGED = 1e-4  # [m, rad] a step below it ends a level
+# [m, rad] a step below it ends a level, finest first: coarse ones only have to lead into the next
+CONVERGED = (1e-4, 1e-3, 2e-3)
 FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.005  # of intensities in [0, 1]
 DAMPING = 1e-9  # times the trace: keeps the equations solvable where a direction is open
 MAX_UNCERTAINTY = 0.05  # [m] of the translation in its weakest direction
@@ -95,7 +96,7 @@ def register(
             damping = DAMPING * np.trace(equations.H) + 1e-6
             twist = -np.linalg.solve(equations.H + damping * np.eye(6), equations.b)
             T = se3.normalized(se3.exp(twist) @ T)
-            if np.abs(twist).max() < CONVERGED:
+            if np.abs(twist).max() < CONVERGED[level]:
                 break
     return _result(T, _sum(source, targets, T, 0, sigma, photometric_weight))
 
