@@ -5,10 +5,10 @@ run.
     python benchmarks/quality.py --scenes synthetic --methods ours tsdf-1cm            needs no data
     python benchmarks/quality.py --scenes kitchen --methods ours mine.yaml tsdf-1cm    ours under another configuration
 
-Prints a table; writes quality.json and, for every scene, pictures of held-out frames and of the
-worst regions. Surface metrics compare 100,000 points each way, cropped to what the cameras saw;
-depth and colour are those of held-out frames between the fused ones. Needs the extra open3d for the
-TSDF.
+Prints a table, and one of depth and colour in those readings alone where the surface of every method is
+hit; writes quality.json and, for every scene, pictures of held-out frames and of the worst regions. Surface
+metrics compare 100,000 points each way, cropped to what the cameras saw; depth and colour are those of
+held-out frames between the fused ones. Needs the extra open3d for the TSDF.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ import argparse
 import gc
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from quality_methods import METHODS, Reconstruction, method
 from quality_pictures import REGIONS, compare, overview_frames, write_overview, write_worst
 from quality_scenes import DEPTH_RANGE, SCENES, Scene
+from quality_shared import SHARED_COLUMNS, render_held_out, score_shared
 
 import taichi_unifusion as uf
 from taichi_unifusion.errors import UniFusionError
@@ -99,19 +100,21 @@ def worst_frames(scene: Scene, scores: Sequence[FrameScore]) -> list[Frame]:
     return [scene.held_out[i] for i in sorted(range(len(shares)), key=shares.__getitem__)[:REGIONS]]
 
 
-def table(results: dict[str, dict[str, dict]]) -> str:
+def table(
+    results: dict[str, dict[str, dict]], columns: Mapping[str, tuple[str, str]] = COLUMNS
+) -> str:
     """Markdown, one block of rows a scene."""
-    rows = [["scene", "method", *COLUMNS]]
+    rows = [["scene", "method", *columns]]
     for scene, methods in results.items():
         for name, row in methods.items():
-            values = [row["numbers"].get(key) for key, _ in COLUMNS.values()]
+            values = [row["numbers"].get(key) for key, _ in columns.values()]
             rows.append(
                 [
                     scene,
                     name,
                     *(
                         "-" if value is None else format(value, style).rstrip("%")
-                        for value, (_, style) in zip(values, COLUMNS.values(), strict=True)
+                        for value, (_, style) in zip(values, columns.values(), strict=True)
                     ),
                 ]
             )
@@ -136,6 +139,11 @@ def table(results: dict[str, dict[str, dict]]) -> str:
     return "\n".join([lines[0], rule, *lines[1:]])
 
 
+def write_results(folder: Path, results: dict[str, dict[str, dict]]) -> None:
+    """Every number and setting so far."""
+    (folder / "quality.json").write_text(json.dumps(results, indent=1, default=str))
+
+
 def run(options: argparse.Namespace) -> dict[str, dict[str, dict]]:
     """Every method on every scene; what is done is written at once, so that a long run loses
     nothing.
@@ -147,22 +155,26 @@ def run(options: argparse.Namespace) -> dict[str, dict[str, dict]]:
             f"{scene_name}: {len(scene.frames)} frames fused, {len(scene.held_out)} held out",
             flush=True,
         )
-        rows, pictures = results.setdefault(scene_name, {}), {}
+        rows, pictures, rendered = results.setdefault(scene_name, {}), {}, {}
         for name in options.methods:
             reconstruction = method(name)(scene.frames, scene.nearest)
             label = Path(name).stem if name not in METHODS else name
             numbers, scores = measure(reconstruction, scene)
             rows[label] = {"numbers": numbers, "settings": reconstruction.settings}
             print(table({scene_name: {label: rows[label]}}).splitlines()[2], flush=True)
+            if len(options.methods) > 1:
+                rendered[label] = render_held_out(reconstruction, scene)
             if options.out:
                 worst = compare(reconstruction, worst_frames(scene, scores))
                 write_worst(options.out / f"worst-{scene_name}-{label}.jpg", worst)
                 pictures[label] = compare(reconstruction, overview_frames(scene))
-                (options.out / "quality.json").write_text(
-                    json.dumps(results, indent=1, default=str)
-                )
+                write_results(options.out, results)
             del reconstruction
             gc.collect()  # maps give their memory back before the next are made
+        for label, numbers in score_shared(rendered, scene.held_out, scene.nearest).items():
+            rows[label]["numbers"].update(numbers)
+        if options.out:
+            write_results(options.out, results)
         if pictures:
             write_overview(options.out / f"{scene_name}.jpg", pictures)
     return results
@@ -204,7 +216,12 @@ def main() -> int:
         if options.out:
             check_writable(options.out)
         uf.init(threads=options.threads)
-        print(table(run(options)))
+        results = run(options)
+        print(table(results))
+        if len(options.methods) > 1:
+            print(
+                "\nWhere the surface of every method is hit:\n\n" + table(results, SHARED_COLUMNS)
+            )
     except UniFusionError as error:
         raise SystemExit(f"quality: {error}") from None
     return 0

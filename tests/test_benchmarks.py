@@ -25,6 +25,7 @@ import house  # noqa: E402
 import properties_flicker  # noqa: E402
 import quality  # noqa: E402
 import quality_pictures  # noqa: E402
+import quality_shared  # noqa: E402
 import rendering  # noqa: E402
 import speed  # noqa: E402
 import speed_profile  # noqa: E402
@@ -121,6 +122,30 @@ def test_table_has_a_dash_where_nothing_was_measured():
         "ours",
     )
     assert len(rule) == len(titles)
+
+
+def test_methods_are_compared_where_all_of_them_have_a_surface():
+    depth, color = np.full((24, 32), 2.0, np.float32), np.full((24, 32, 3), 51, np.uint8)
+    depth[:, 30:] = 0  # no reading
+    frame = Frame(
+        depth, PinholeCamera(32, 24, 30, 30, 16, 12), color=color, T_world_camera=np.eye(4)
+    )
+
+    def rendered(off, hole, shade):
+        seen = np.where(np.arange(32) < hole, np.inf, 2.0 + off).astype(np.float32)
+        image = np.full((24, 32, 3), shade, np.float16)
+        seen = np.tile(seen, (24, 1))
+        seen[:, 10] += 10 * off  # what only one method has to answer for counts for none
+        return [quality_shared.RenderedFrame(seen, image)]
+
+    scores = quality_shared.score_shared(
+        {"whole": rendered(0.01, 0, 0.2), "holes": rendered(0.02, 15, 0.3)}, [frame], 0.4
+    )
+    assert scores["whole"]["shared_coverage"] == scores["holes"]["shared_coverage"] == 0.5
+    assert scores["whole"]["shared_l1_cm"] == pytest.approx(1, rel=1e-4)  # without column 10
+    assert scores["holes"]["shared_l1_cm"] == pytest.approx(2, rel=1e-4)
+    assert scores["holes"]["shared_psnr_db"] == pytest.approx(20, abs=0.05)
+    assert scores["whole"]["shared_psnr_db"] > 60 and scores["whole"]["shared_ssim"] > 0.99
 
 
 def test_methods_are_named_or_files(tmp_path):
