@@ -37,6 +37,7 @@ from .maps.settings import (
     PropertySettings,
     SurfaceSettings,
     check_voxel_size,
+    color_settings,
     parse_bytes,
 )
 from .preprocessing import PreprocessSettings
@@ -112,7 +113,7 @@ class Config:
     """
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     """The map of the surface."""
-    color: PropertySettings = field(default_factory=PropertySettings)
+    color: PropertySettings = field(default_factory=color_settings)
     """The map of its colour."""
     properties: tuple[str, ...] = ()
     """What else to map, as NAME[=METHOD[:FILE]][,option=value...], for example saliency or

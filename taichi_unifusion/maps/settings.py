@@ -144,7 +144,9 @@ class PropertySettings(MapSettings):
     min_points: int = 1
     """Voxels with fewer samples in a frame are left out of that frame."""
     encoder: EncoderSettings = field(default_factory=lambda: EncoderSettings(rank=12))
-    """The position encoding; 12 eigenpairs render as well as 20 here, and half the work."""
+    """The position encoding; 12 eigenpairs are enough for most properties, at half the work of 20, which
+    the colour of a `Config` has.
+    """
     prior: Literal["mean", "zero"] = "mean"
     """What the field falls back to where a voxel has no data: the voxel's mean, or zero as
     published.
@@ -157,6 +159,11 @@ class PropertySettings(MapSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("prior", self.prior, ("mean", "zero"))
+
+
+def color_settings() -> PropertySettings:
+    """Those of colour, which every pixel has, finer than most properties and with less noise."""
+    return PropertySettings(noise=0.01, encoder=EncoderSettings(rank=20))
 
 
 @strict
