@@ -93,15 +93,17 @@ def render(options: Render) -> int:
     from ..viewer.render import Picturing, camera_of
     from ..viewer.several import with_shared_scales
 
-    sink = _check_out(options, size)
-    scenes = with_shared_scales([_open(path, options) for path in options.dirs])
-    camera = camera_of(_panel(size, len(scenes)), options.fov)
-    poses = _poses(options, scenes[0], camera)
-    layer = _layer(options)
-    runtime.init(options.encoder.device)
-    shown = [
-        Picturing(scene, layer, camera, options.samples, not options.no_legend) for scene in scenes
-    ]
+    with _no_empty_folder(options.out):
+        sink = _check_out(options, size)
+        scenes = with_shared_scales([_open(path, options) for path in options.dirs])
+        camera = camera_of(_panel(size, len(scenes)), options.fov)
+        poses = _poses(options, scenes[0], camera)
+        layer = _layer(options)
+        runtime.init(options.encoder.device)
+        shown = [
+            Picturing(scene, layer, camera, options.samples, not options.no_legend)
+            for scene in scenes
+        ]
     with (
         stop_on_signal(clean_up=lambda: _remove_unfinished(options.out)) as stop,
         sink() as write,
@@ -208,6 +210,19 @@ def _check_out(
     else:
         folder = check_writable(options.out)
     return lambda: _opened(options, folder, size)
+
+
+@contextmanager
+def _no_empty_folder(path: Path) -> Iterator[None]:
+    """Where what is done inside fails, a folder that was made for it, and holds nothing, goes."""
+    new = not path.exists()
+    try:
+        yield
+    except BaseException:
+        if new and path.is_dir():
+            with suppress(OSError):
+                path.rmdir()
+        raise
 
 
 @contextmanager

@@ -44,7 +44,7 @@ class Voters:
         self.counted: dict[int, VoxelData] = {}  # votes of tiles that left memory, by code
         self._views: list[NDArray[np.float32]] = []  # (3, 4) T_camera_world
         self._camera: PinholeCamera | None = None
-        self._seen: set[int] = set()
+        self._seen: list[NDArray[np.float64]] = []  # (N, 3) world [m] along their rays
 
     def add(self, frame: Frame) -> None:
         """Let a frame vote, now or with the next ones; raises FileError, MapCorrupt or CapacityError."""
@@ -55,8 +55,7 @@ class Voters:
             self._images = ti.ndarray(ti.f32, (VIEWS, *frame.depth.shape))
         invert_depth(frame, self.settings, self._images, len(self._views))
         self._views.append(inverse(frame.require_pose())[:3].astype(np.float32))
-        points = seen_points(frame, self.surface.voxel_size * TILE / 2)
-        self._seen |= self.tiles.codes(points, SEEN_HALO)
+        self._seen.append(seen_points(frame, self.surface.voxel_size * TILE / 2))
 
     def cast(self) -> None:
         """Count the votes of the frames that wait."""
@@ -64,10 +63,10 @@ class Voters:
             return
         if self.tiles.bytes > self.limit:
             self._count()
-        self.tiles.bring(sorted(self._seen))
+        self.tiles.bring(sorted(self.tiles.codes(np.concatenate(self._seen), SEEN_HALO)))
         slots = 0, self.surface.grid.count
         self.surface.vote(self._images, self._camera, np.array(self._views), slots)
-        self._views, self._seen = [], set()
+        self._views, self._seen = [], []
 
     def votes(self) -> Mapping[Tile, Mapping[str, NDArray]]:
         """The votes of all frames, as the tiles of a folder."""

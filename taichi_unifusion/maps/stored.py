@@ -8,7 +8,7 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal, get_origin, get_type_hints
 
 import numpy as np
@@ -226,13 +226,18 @@ def exact(value: object, wanted: Any, name: str) -> Any:
     return convert(value, wanted, name)
 
 
+@cache
+def _types(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
 def _settings(kind: type, values: object, where: str) -> Any:
     """Settings of a class from a file's values, each of its very type; what an older version did not
     know has its default.
     """
     if not isinstance(values, dict):
         raise InputError(f"{where}: expected names and values, got {shortened(values)}")
-    types = get_type_hints(kind)
+    types = _types(kind)
     _check_keys(values, types, where)
     read = {
         key: _settings(types[key], value, f"{where}.{key}")

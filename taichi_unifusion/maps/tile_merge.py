@@ -27,25 +27,24 @@ def merge_tiles(parts: Sequence[TileFolder], out: TileFolder, tiles: Iterable[Ti
     wanted = describe_tiles(out)
     if (wanted.kind, wanted.name, wanted.channels) != _identity(description):
         raise InputError(f"merge: {out.path} is for another map than {parts[0].path}")
-    tiles, scratch = sorted(tiles), empty_map(description)
+    tiles = sorted(tile for tile in tiles if any(tile in part.tiles for part in parts))
+    scratch = empty_map(description)
     added = [field for field in wanted.fields if field not in description.fields]
 
     def total(tile: Tile) -> dict[str, NDArray]:
-        scratch.grid.retain(np.zeros(0, np.int32))
-        for part in parts:
-            if tile not in part.tiles:
-                continue
-            data = read_tile(part, tile)
-            if len(scratch.grid):
-                scratch.fuse_voxels(data)
-            else:
-                scratch.grid.add(data)
-        data = scratch.grid.export()
+        first, *others = (part for part in parts if tile in part.tiles)
+        data = read_tile(first, tile)
+        if others:
+            scratch.grid.clear()
+            scratch.grid.add(data)
+            for part in others:
+                scratch.fuse_voxels(read_tile(part, tile))
+            data = scratch.grid.export()
         more = {each.name: np.zeros((len(data), *each.shape), each.dtype) for each in added}
         return {**data.tensors, **more}
 
     out.write_each((tile, total(tile)) for tile in tiles)
-    return sum(out.tiles[tile].voxels for tile in tiles if tile in out.tiles)
+    return sum(out.tiles[tile].voxels for tile in tiles)
 
 
 def as_tiles(path: Path, folder: Path) -> TileFolder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from itertools import compress, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,19 @@ def place_codes(voxels: NDArray) -> NDArray[np.int64]:
     """The tile (N,) of places (N, 3) in voxels, any tile for those that are not numbers."""
     most = (CODE_OFFSET - 1) * TILE
     return key_codes(np.floor(np.clip(np.nan_to_num(voxels), -most, most)).astype(np.int32))
+
+
+def codes_between(low: NDArray[np.int64], high: NDArray[np.int64]) -> Iterator[int]:
+    """The tiles (N,) of the low and high corners of boxes that are smaller than a tile, and those
+    between; some come more than once.
+    """
+    # no axis is more than one tile farther: three bits; few boxes differ
+    axes = (2 * CODE_BITS, CODE_BITS, 0)
+    bits = sum((high - low >> shift & 1) << n for n, shift in enumerate(axes))
+    for box in np.unique(low << 3 | bits).tolist():
+        farther = [1 << shift for n, shift in enumerate(axes) if box >> n & 1]
+        for chosen in product((0, 1), repeat=len(farther)):
+            yield (box >> 3) + sum(compress(farther, chosen))
 
 
 def code_of(tile: Tile) -> int:

@@ -22,7 +22,7 @@ from . import empty_map
 from .base_map import BaseMap
 from .settings import parse_bytes
 from .stored import describe_tiles, read_tile
-from .tile_places import TILE, code_of, key_codes, place_codes, tile_of
+from .tile_places import TILE, code_of, codes_between, key_codes, place_codes, tile_of
 
 logger = logging.getLogger(__name__)
 
@@ -50,12 +50,7 @@ class WorkingSet:
     def codes(self, points: NDArray, halo: int = HALO) -> set[int]:
         """The tiles around points (N, 3) world [m], by code."""
         voxels = points / self.map.voxel_size
-        low, high = place_codes(voxels - halo), place_codes(voxels + halo)
-        # most points lie within one tile
-        found, some = set(np.unique(low).tolist()), voxels[low != high]
-        for step in np.array(np.meshgrid(*[[-halo, halo]] * 3)).reshape(3, -1).T:
-            found |= set(np.unique(place_codes(some + step)).tolist())
-        return found
+        return set(codes_between(place_codes(voxels - halo), place_codes(voxels + halo)))
 
     def bring(self, codes: Iterable[int]) -> None:
         """Load the tiles among `codes` that only the folder has; raises FileError, MapCorrupt or

@@ -20,7 +20,7 @@ from .record import MeshRecord
 
 logger = logging.getLogger(__name__)
 READING_MEMORY = 1_000_000_000  # bytes of maps in tiles that are read again
-PICTURE_RESOLUTION = 1  # cells a voxel of the mesh that pictures are drawn from
+PICTURE_TRIANGLES = 4_000_000  # of the mesh that pictures are drawn from, about
 
 
 def write_tiles(writer: FolderWriter, memory: MapMemory) -> None:
@@ -48,6 +48,15 @@ def open_memory(maps: Mapping[str, Path]) -> MapMemory | None:
         if describe_tiles(each).kind in ("surface", "property")  # others give vertices no value
     }
     return MapMemory.over(shown, READING_MEMORY)
+
+
+def picture_resolution(memory: MapMemory, settings: MeshSettings) -> int:
+    """Cells a voxel of the mesh that pictures are drawn from: those of `settings`, or fewer where that
+    would not fit into memory.
+    """
+    voxels = memory.sets["surface"].folder.voxels
+    fits = int((PICTURE_TRIANGLES / max(voxels, 1)) ** 0.5)  # a voxel has about r^2 triangles
+    return min(max(fits, 1), settings.resolution)
 
 
 def write_mesh_by_tiles(

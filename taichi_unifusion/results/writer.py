@@ -36,7 +36,7 @@ from .ownership import strangers
 from .property_files import looks_of, write_property_picture
 from .record import MeshRecord, RunRecord, Seconds, Source, write_record
 from .run_folder import MESH_SUFFIXES, RunFolder
-from .tiled import PICTURE_RESOLUTION, write_mesh_by_tiles, write_tiles
+from .tiled import picture_resolution, write_mesh_by_tiles, write_tiles
 
 logger = logging.getLogger(__name__)
 
@@ -105,7 +105,8 @@ def write_results(
     extracting, mesh = time.perf_counter(), None
     if pipeline.config.mesh.extract:
         logger.info("extracting the mesh")
-        resolution = PICTURE_RESOLUTION if pipeline.memory else None
+        memory, settings = pipeline.memory, pipeline.config.mesh
+        resolution = picture_resolution(memory, settings) if memory else None
         mesh = writer.attempt(
             f"{folder.path}: the mesh could not be extracted",
             lambda: pipeline.extract_mesh(resolution),

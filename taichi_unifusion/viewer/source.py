@@ -81,6 +81,12 @@ class ResultsSource:
         return self.folder is not None and "surface" in self.folder.maps
 
     @property
+    def mesh_settings(self) -> MeshSettings:
+        """How the run made its mesh; raises ConfigError where its settings cannot be read."""
+        config = self._folder.config
+        return load_config(config).mesh if config.exists() else MeshSettings()
+
+    @property
     def has_features(self) -> bool:
         """Whether there is a map that questions can be put to, and an encoder for the words."""
         return (
@@ -127,8 +133,7 @@ class ResultsSource:
         """
         from ..maps.tiled_mesh import joined_mesh
 
-        folder = self._folder
-        settings = load_config(folder.config).mesh if folder.config.exists() else MeshSettings()
+        folder, settings = self._folder, self.mesh_settings
         if self._memory is not None:
             mesh = joined_mesh(self._memory, resolution, settings.min_area, on_piece=on_piece)
         else:

@@ -38,7 +38,8 @@ class LayerPanel:
         self.cameras = CameraPanel(results)
         self.with_maps = [i for i, source in enumerate(results.sources) if source.has_maps]
         if self.with_maps:
-            self.resolution = gui.add_slider("Cells a voxel", 1, 8, 1, 4)
+            usual = results.sources[self.with_maps[0]].mesh_settings.resolution
+            self.resolution = gui.add_slider("Cells a voxel", 1, 8, 1, min(usual, 8))
             again = gui.add_button("Extract the mesh again")
             again.on_click(lambda event: request(lambda: self._extract(event.client), event.client))
             self.progress = gui.add_progress_bar(0.0, visible=False)

@@ -97,6 +97,7 @@ def test_what_cannot_be_rendered_is_told(results, tmp_path, capsys, words, told)
     out = [] if "--out" in words else ["--out", str(tmp_path / "out")]
     assert cli.main(["render", str(results.path), *out, *words]) == 2
     assert told in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()  # nor an empty folder
 
 
 def test_no_results_are_told(tmp_path, capsys):

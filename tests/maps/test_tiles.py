@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,15 @@ from taichi_unifusion.errors import FileError, InputError, MapCorrupt
 from taichi_unifusion.files.tiles import TileFolder
 from taichi_unifusion.maps.settings import parse_bytes
 from taichi_unifusion.maps.stored import read_tile
-from taichi_unifusion.maps.tile_places import TILE, code_of, key_codes, tile_of, tiles_around
+from taichi_unifusion.maps.tile_places import (
+    TILE,
+    code_of,
+    codes_between,
+    key_codes,
+    place_codes,
+    tile_of,
+    tiles_around,
+)
 from taichi_unifusion.maps.voxel_data import VoxelData
 from taichi_unifusion.pipeline import Pipeline
 
@@ -244,3 +253,13 @@ def test_no_folder_is_no_tiled_map(tmp_path):
     assert not TileFolder.is_one(tmp_path)
     with pytest.raises(FileError, match="no such file"):
         TileFolder.open(tmp_path)
+
+
+def test_the_tiles_around_points_are_those_of_every_corner_of_their_boxes():
+    voxels = np.random.default_rng(3).uniform(-200, 200, (500, 3))
+    voxels[:200] = 64 * np.rint(voxels[:200] / 64) + voxels[:200] % 5  # at borders, corners too
+    halo = 2
+    steps = [halo * np.array(step) for step in product((-1, 0, 1), repeat=3)]
+    corners = {code for step in steps for code in place_codes(voxels + step).tolist()}
+    found = set(codes_between(place_codes(voxels - halo), place_codes(voxels + halo)))
+    assert found == corners and len(found) > len(set(place_codes(voxels).tolist()))

@@ -11,12 +11,15 @@ from mesh_laws import assert_welded, triangles
 from windows import CONFIG, place_of, seen_from
 
 from taichi_unifusion import load_map
+from taichi_unifusion.config import MeshSettings
 from taichi_unifusion.errors import FileError
+from taichi_unifusion.files.images import read_color
 from taichi_unifusion.files.mesh_reading import read_mesh
 from taichi_unifusion.files.mesh_stream import MeshStream
 from taichi_unifusion.pipeline import Pipeline
 from taichi_unifusion.results.inspection import inspect
 from taichi_unifusion.results.run_folder import RunFolder
+from taichi_unifusion.results.tiled import open_memory, picture_resolution
 from taichi_unifusion.results.writer import write_results
 from taichi_unifusion.types import Mesh
 
@@ -55,6 +58,20 @@ def test_the_mesh_file_is_that_of_the_whole_maps(folders):
     np.testing.assert_array_equal(
         *(mesh.attributes["color"][np.lexsort(mesh.vertices.T)] for mesh in (tiled, whole))
     )
+
+
+def test_pictures_show_the_mesh_or_fewer_cells_of_a_voxel_where_it_is_too_large(
+    folders, monkeypatch
+):
+    tiled, whole = folders
+    np.testing.assert_array_equal(*(read_color(each.preview) for each in (tiled, whole)))
+    memory, settings = open_memory(tiled.maps), MeshSettings(resolution=4)
+    assert picture_resolution(memory, settings) == 4
+    voxels = memory.sets["surface"].folder.voxels
+    monkeypatch.setattr("taichi_unifusion.results.tiled.PICTURE_TRIANGLES", 6 * voxels)
+    assert picture_resolution(memory, settings) == 2
+    monkeypatch.setattr("taichi_unifusion.results.tiled.PICTURE_TRIANGLES", 1)
+    assert picture_resolution(memory, settings) == 1
 
 
 def test_a_map_in_tiles_loads_as_one(folders):
