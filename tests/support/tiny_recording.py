@@ -5,6 +5,7 @@ that fit them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from places import DEVICE
 
 from taichi_unifusion.config import Config
 from taichi_unifusion.datasets.synthetic import SyntheticRoom
-from taichi_unifusion.maps.settings import PropertySettings, SurfaceSettings
+from taichi_unifusion.maps.settings import SurfaceSettings, color_settings
 from taichi_unifusion.types import Frame
 
 WIDTH, HEIGHT, DEPTH_SCALE = 160, 120, 1000.0
@@ -23,7 +24,7 @@ WIDTH, HEIGHT, DEPTH_SCALE = 160, 120, 1000.0
 CONFIG = Config(
     device=DEVICE,
     surface=SurfaceSettings(voxel_size=0.1, support_points=1),
-    color=PropertySettings(voxel_size=0.05),
+    color=replace(color_settings(), voxel_size=0.05),
 )
 FLAGS = [
     "--device",
