@@ -171,9 +171,9 @@ def _map(
     result = tracker.finish()
     run = settle(pipeline, run, tracker.current_poses())
     written = _write_tracking(folder, result) if source.tracking != "given" else ()
-    written = (*written, *(windows := keep_store(folder, store, output)))
-    if windows:
-        written = (*written, *keep_keyframes(folder, tracker.keyframes()))
+    windows = keep_store(folder, store, output)
+    keyframes = keep_keyframes(folder, tracker.keyframes()) if windows else ()
+    written = (*written, *windows, *keyframes)
     details = {
         **result.details,
         "mode": source.tracking,
